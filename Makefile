@@ -1,0 +1,64 @@
+# The short way to the commands. `make help` lists the targets; every command also stands alone (`grasp-train --help`).
+SIZE ?= 10k
+TASK ?= regular
+OUT ?= data/$(TASK)-$(SIZE)
+SEED ?= 0
+TORCH_INDEX ?=
+TEST_WORKERS ?= 2
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+EXTRAS := sim,dev
+QUICK := runs/quickstart
+QUICK_STEPS := 600
+export PYTHONUNBUFFERED := 1
+
+.PHONY: help setup quickstart test lint types data clean
+
+help: ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+
+setup: $(STAMP) ## make .venv and install everything into it
+
+$(STAMP): pyproject.toml constraints.txt
+	@set -e; \
+	if [ ! -x $(BIN)/python ]; then \
+	  is311='import sys; sys.exit(sys.version_info[:2] != (3, 11))'; \
+	  if command -v python3 >/dev/null && python3 -c "$$is311"; then python3 -m venv $(VENV); \
+	  elif command -v python3.11 >/dev/null && python3.11 -c "$$is311"; then python3.11 -m venv $(VENV); \
+	  elif command -v uv >/dev/null; then uv venv --seed --python 3.11 $(VENV); \
+	  else echo "Python 3.11 is needed (PyBullet has no wheel for a newer one): install python3.11 with its venv module, or uv" >&2; exit 2; fi; \
+	fi
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt pip setuptools wheel
+	$(if $(TORCH_INDEX),$(BIN)/python -m pip install -q --disable-pip-version-check --index-url $(TORCH_INDEX) -c constraints.txt torch)
+	$(BIN)/python -m pip install -q --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[$(EXTRAS)]'
+	@touch $@
+
+data: setup ## collect SIZE=10k|100k|1M grasps [TASK=regular|targeted] [WORKERS=n] [SEED=n] [OUT=folder]
+	$(BIN)/grasp-datagen --task '$(TASK)' --size '$(SIZE)' --seed '$(SEED)' --out '$(OUT)' $(if $(WORKERS),--workers '$(WORKERS)')
+
+quickstart: setup ## the whole job, small: objects, 2,000 grasps, mc and dql, scored, a report (at most 15 minutes)
+	$(BIN)/grasp-datagen --size 2000 --out data/quickstart
+	$(BIN)/grasp-train --algo mc --shards data/quickstart --steps $(QUICK_STEPS) --out $(QUICK)/mc
+	$(BIN)/grasp-train --algo dql --shards data/quickstart --steps $(QUICK_STEPS) --out $(QUICK)/dql
+	$(BIN)/grasp-eval $(QUICK)/mc $(QUICK)/dql --policy random --episodes 200 --out $(QUICK)/evaluations
+	$(BIN)/grasp-report $(QUICK)/mc $(QUICK)/dql --out $(QUICK)/report.html
+	@echo "open $(QUICK)/report.html"
+
+test: setup lint types ## everything that CI checks (at most 10 minutes)
+	$(BIN)/python -P -m pytest -n $(TEST_WORKERS) --dist loadfile
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# Type checkers cannot follow the editable map of folders to subpackages: they are given an installed copy.
+types: setup
+	@rm -rf .types build
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation --target .types .
+	@rm -rf build
+	cd .types && ../$(BIN)/mypy --config-file ../pyproject.toml -p graspq
+
+clean: ## remove what can be made again, but for data/ and runs/
+	rm -rf $(VENV) .types build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

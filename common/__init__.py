@@ -1,0 +1,1 @@
+"""Shared ground of all folders: seeding, settings as command-line options, durable files, provenance."""

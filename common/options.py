@@ -1,0 +1,286 @@
+"""Command-line options generated from the frozen dataclass that holds a command's settings.
+
+The dataclass is the single source of names, types, defaults, ranges and help; `config.json` is the same dataclass as
+JSON. Whatever is wrong with the user's input becomes one line on standard error and exit status 2.
+"""
+
+import dataclasses
+import functools
+import re
+import sys
+import types
+import typing
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+import graspq
+from graspq.common.errors import UserError
+
+S = TypeVar("S", bound="Settings")
+INTERRUPTED = 130
+
+
+def setting(
+    default: Any = dataclasses.MISSING,
+    *,
+    help: str,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    positional: bool = False,
+    parse: Callable[[str], Any] | None = None,
+    metavar: str | None = None,
+) -> Any:
+    """Return a dataclass field that is also a command-line option.
+
+    Args:
+        default: value when the option is not given; without one the option is required.
+        help: one sentence with unit and range.
+        minimum: least allowed value (inclusive).
+        maximum: greatest allowed value (inclusive).
+        positional: make it an argument (`RUN...`) rather than an option.
+        parse: turns the text of the command line into the value; raises `ValueError` saying what was expected.
+        metavar: placeholder in the help text.
+    """
+    metadata = {
+        "help": help,
+        "minimum": minimum,
+        "maximum": maximum,
+        "positional": positional,
+        "parse": parse,
+        "metavar": metavar,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Base of every command's settings: validates ranges and choices, reads and writes JSON."""
+
+    def __post_init__(self) -> None:
+        """Check ranges and choices.
+
+        Raises:
+            UserError: a value is outside its range or not one of its choices.
+        """
+        hints = typing.get_type_hints(type(self))
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is None:
+                continue
+            choices = typing.get_args(hints[field.name]) if _is_literal(hints[field.name]) else ()
+            if choices and value not in choices:
+                raise UserError(f"{flag(field.name)}: {value!r} is unknown; choose from {', '.join(map(str, choices))}")
+            _check_range(field, value)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings as plain JSON values."""
+        return {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
+
+    @classmethod
+    def from_json(cls: type[S], values: dict[str, Any]) -> S:
+        """Return the settings that `to_json` wrote; unknown names are refused, missing ones take their defaults.
+
+        Raises:
+            UserError: a name is unknown or a value is out of range.
+        """
+        hints = typing.get_type_hints(cls)
+        known = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise UserError(f"unknown setting {unknown[0]!r}; expected some of {', '.join(sorted(known))}")
+        return cls(**{name: _restored(hints[name], value) for name, value in values.items()})
+
+
+def _check_range(field: Any, value: Any) -> None:
+    minimum, maximum = field.metadata.get("minimum"), field.metadata.get("maximum")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return
+    too_low = minimum is not None and not value >= minimum
+    too_high = maximum is not None and not value <= maximum
+    if not too_low and not too_high:
+        return
+    limits = (("at least", minimum), ("at most", maximum))
+    bounds = [f"{words} {limit:g}" for words, limit in limits if limit is not None]
+    raise UserError(f"{flag(field.name)}: expected a number of {' and '.join(bounds)}, got {value}")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _restored(hint: Any, value: Any) -> Any:
+    if isinstance(value, list):
+        inner = typing.get_args(hint)
+        return tuple(_restored(inner[0] if inner else str, item) for item in value)
+    if value is not None and (hint is Path or Path in typing.get_args(hint)):
+        return Path(value)
+    return value
+
+
+def flag(name: str) -> str:
+    """Return the option of a settings field: `batch_size` is `--batch-size`."""
+    return "--" + name.replace("_", "-")
+
+
+def parse_count(text: str) -> int:
+    """Return a count written plainly or with k or M: `2500`, `10k`, `1M`.
+
+    Raises:
+        ValueError: the text is no whole number of at least 1.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([kKmM]?)", text.strip())
+    factor = {"": 1, "k": 1_000, "m": 1_000_000}
+    value = float(match[1]) * factor[match[2].lower()] if match else 0.0
+    if value < 1 or value != int(value):
+        raise ValueError("expected a whole number of at least 1, such as 2500, 10k or 1M")
+    return int(value)
+
+
+class _Parsed(click.ParamType):  # type: ignore[type-arg]
+    """A click type around a `parse` function."""
+
+    def __init__(self, parse: Callable[[str], Any], name: str) -> None:
+        self.parse, self.name = parse, name
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            return self.parse(value)
+        except UserError:
+            raise
+        except ValueError as error:
+            self.fail(f"{value!r}: {error}", param, ctx)
+
+
+def options_from(settings_type: type[Settings]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator that gives a click command the options of `settings_type`.
+
+    The decorated function receives one argument, the validated settings.
+    """
+
+    def decorate(function: Callable[[Any], Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def command(**values: Any) -> Any:
+            return function(settings_type(**values))
+
+        hints = typing.get_type_hints(settings_type)
+        for field in reversed(dataclasses.fields(settings_type)):
+            if field.metadata.get("help") is not None:
+                command = _parameter(field, hints[field.name])(command)
+        return command
+
+    return decorate
+
+
+def _is_literal(hint: Any) -> bool:
+    return typing.get_origin(hint) is typing.Literal
+
+
+def _parameter(field: Any, hint: Any) -> Callable[..., Any]:
+    several = typing.get_origin(hint) is tuple
+    inner = typing.get_args(hint)[0] if several else _without_none(hint)
+    parse = field.metadata["parse"]
+    required = field.default is dataclasses.MISSING
+    kind = _Parsed(parse, field.name) if parse is not None else _click_type(inner)
+    if field.metadata["positional"]:
+        return click.argument(
+            field.name, type=kind, nargs=-1 if several else 1, required=required, metavar=field.metadata["metavar"]
+        )
+    arguments: dict[str, Any] = {"help": field.metadata["help"], "required": required, "multiple": several}
+    if not required and field.default is not None and field.default != ():
+        arguments |= {"default": field.default, "show_default": True}
+    elif several:
+        arguments["default"] = ()
+    if inner is bool:
+        return click.option(f"{flag(field.name)}/--no-{flag(field.name)[2:]}", field.name, **arguments)
+    metavar = field.metadata["metavar"]
+    return click.option(flag(field.name), field.name, type=kind, metavar=metavar, **arguments)
+
+
+def _without_none(hint: Any) -> Any:
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        return next(part for part in typing.get_args(hint) if part is not type(None))
+    return hint
+
+
+def _click_type(hint: Any) -> Any:
+    if _is_literal(hint):
+        return click.Choice([str(choice) for choice in typing.get_args(hint)])
+    return {int: click.INT, float: click.FLOAT, str: click.STRING, bool: click.BOOL}.get(
+        hint, click.Path(path_type=Path) if hint is Path else click.STRING
+    )
+
+
+def _spread_repeated(command: click.Command, args: list[str]) -> list[str]:
+    """Let an option that may be repeated take several words, as a shell's glob gives: `--shards a b c`."""
+    if any(isinstance(parameter, click.Argument) for parameter in command.params):
+        return args
+    repeated = {
+        name for parameter in command.params if getattr(parameter, "multiple", False) for name in parameter.opts
+    }
+    spread: list[str] = []
+    current: str | None = None
+    for word in args:
+        if word.startswith("-"):
+            current = word if word in repeated else None
+            spread.append(word)
+        elif current is not None and spread[-1] != current:
+            spread += [current, word]
+        else:
+            spread.append(word)
+    return spread
+
+
+class _OneLineErrors:
+    """Turns every mistake of the user into one line and exit status 2."""
+
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> Any:
+        """Run the command and exit; see the class."""
+        extra.pop("standalone_mode", None)
+        try:
+            result = super().main(args=args, prog_name=prog_name, standalone_mode=False, **extra)  # type: ignore[misc]
+        except click.exceptions.Abort:
+            click.echo("interrupted", err=True)
+            sys.exit(INTERRUPTED)
+        except click.UsageError as error:
+            where = error.ctx.command_path if error.ctx is not None else (prog_name or "graspq")
+            click.echo(f"{where}: {_one_line(error.format_message())} (see {where} --help)", err=True)
+            sys.exit(2)
+        except click.ClickException as error:
+            click.echo(f"error: {_one_line(error.format_message())}", err=True)
+            sys.exit(error.exit_code)
+        except BrokenPipeError:
+            sys.stderr.close()
+            sys.exit(1)
+        sys.exit(result if isinstance(result, int) else 0)
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split())
+
+
+class Command(_OneLineErrors, click.Command):  # type: ignore[misc]
+    """A click command with one-line errors whose repeatable options take several words."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse after spreading repeated options; see `_spread_repeated`."""
+        return super().parse_args(ctx, _spread_repeated(self, args))
+
+
+class Group(_OneLineErrors, click.Group):  # type: ignore[misc]
+    """A click group with one-line errors."""
+
+    command_class = Command
+
+
+def with_version(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--version`, the version of graspq."""
+    return click.version_option(graspq.__version__, prog_name="graspq")(command)

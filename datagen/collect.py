@@ -1,0 +1,64 @@
+"""One block of episodes as a pure function of the dataset's settings and the block's number.
+
+A block is 20 episodes that share their objects; it starts from an emptied world, so it gives the same bytes alone,
+after any other blocks, and in any process. Dimension key: T steps of an episode, H W C image.
+"""
+
+import numpy as np
+
+from graspq.common.seeding import generator, integer_seed
+from graspq.datagen.settings import CollectionSettings
+from graspq.datasets.episode import Episode
+from graspq.sim.episode import GraspSimulation
+from graspq.sim.task import draw_objects
+
+
+def collect_block(
+    simulation: GraspSimulation, settings: CollectionSettings, block: int, episodes: int
+) -> list[Episode]:
+    """Return the first `episodes` episodes of a block.
+
+    Args:
+        simulation: any simulation of the dataset's task and object set; what it did before does not matter.
+        settings: of the dataset.
+        block: number of the block, from 0.
+        episodes: 1 .. block_size; a shorter block is the beginning of the longer one.
+    """
+    draws = generator("datagen/objects", settings.seed, block)
+    simulation.load(draw_objects(simulation.task, simulation.objects, settings.split, draws))
+    first = block * settings.block_size
+    return [_collect_episode(simulation, settings, block, first + index) for index in range(episodes)]
+
+
+def _collect_episode(simulation: GraspSimulation, settings: CollectionSettings, block: int, episode_id: int) -> Episode:
+    seed = integer_seed("datagen/episode", settings.seed, episode_id)
+    policy, draws = settings.random_policy(), generator("datagen/policy", seed)
+    observation = simulation.reset(generator("datagen/scene", seed))
+    object_poses = simulation.object_poses()
+    images, actions, rewards, poses = [], [], [], []
+    terminated, info = False, {}
+    while not terminated:
+        action = policy.act(draws)
+        outcome = simulation.step(action, observe_end=False)
+        images.append(observation.image)
+        poses.append(observation.gripper_pose)
+        actions.append(action)
+        rewards.append(outcome.reward)
+        observation, terminated, info = outcome.observation, outcome.terminated, outcome.info
+    return Episode(
+        episode_id=episode_id,
+        block=block,
+        seed=seed,
+        object_ids=simulation.object_ids,
+        object_poses=object_poses,
+        images=np.stack(images),
+        actions=np.stack(actions),
+        rewards=np.asarray(rewards, dtype=np.float32),
+        gripper_poses=np.stack(poses),
+        final_pose=info["final_pose"],
+        end=info["end"],
+        success=info["success"],
+        lifted_object=info["lifted_object"],
+        policy=settings.policy,
+        exploration=settings.descend_probability,
+    )

@@ -1,0 +1,123 @@
+"""Reads one block, a row group of a steps table, into numpy without copying its images.
+
+Page checksums are verified on every read. Dimension key: N rows of the block, H W C image.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from graspq.common.errors import UserError
+from graspq.datasets.batch import RECORD, Bool, Int64, Records
+from graspq.datasets.episode import Float32, UInt8
+
+REMEDY = "`grasp-data verify` lists all faults; the command that made the dataset makes bad shards again"
+
+
+@dataclass(frozen=True)
+class BlockRef:
+    """Where a block is.
+
+    Attributes:
+        path: the shard's steps table.
+        row_group: its index there.
+        block: its number in its dataset.
+        rows: its number of steps.
+        episodes: its number of episodes.
+        key: what identifies the block wherever the dataset lies, such as `"regular/0/17"` (task, seed, block).
+    """
+
+    path: Path
+    row_group: int
+    block: int
+    rows: int
+    episodes: int
+    key: str
+
+
+@dataclass(frozen=True, eq=False)
+class BlockArrays:
+    """The rows of one block; whole episodes, in order. Read-only views of the Parquet reader's memory.
+
+    Attributes:
+        block: number of the block.
+        images: uint8 [N, H, W, C], RGB.
+        gripper_pose: float32 [N, 4], (x, y, z, φ) before the action; metres and radians.
+        records: RECORD [N], all other columns.
+        first_rows: int64 [E], the first row of each of its E episodes.
+        lengths: int64 [E], steps of each.
+    """
+
+    block: int
+    images: UInt8
+    gripper_pose: Float32
+    records: Records
+    first_rows: Int64
+    lengths: Int64
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it holds."""
+        return self.images.nbytes + self.records.nbytes + self.gripper_pose.nbytes
+
+
+def row_bytes(image_shape: tuple[int, int, int]) -> int:
+    """Return the memory of one row of a `BlockArrays`."""
+    return int(np.prod(image_shape)) + RECORD.itemsize + 4 * 4
+
+
+def read_block(ref: BlockRef, image_shape: tuple[int, int, int], metadata: Any = None) -> BlockArrays:
+    """Return the rows of a block.
+
+    Args:
+        ref: the block.
+        image_shape: (H, W, C).
+        metadata: the file's footer where it was read before.
+
+    Raises:
+        UserError: the file is missing, truncated or damaged; the message names the file and the block.
+    """
+    try:
+        with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
+            table = file.read_row_group(ref.row_group, use_threads=False)
+        return _block_arrays(ref, table, image_shape)
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
+
+
+def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, int]) -> BlockArrays:
+    records = np.zeros(table.num_rows, RECORD)
+    for name in RECORD.names or ():
+        if name != "block":
+            records[name] = _numpy(table.column(name))
+    records["block"] = ref.block
+    terminal: Bool = records["terminal"]
+    first_rows = np.flatnonzero(np.concatenate([[True], terminal[:-1]])).astype(np.int64)
+    if table.num_rows != ref.rows or len(first_rows) != ref.episodes or not terminal[-1]:
+        raise ValueError(f"expected {ref.rows} rows of {ref.episodes} whole episodes")
+    return BlockArrays(
+        block=ref.block,
+        images=_numpy(table.column("image")).reshape(-1, *image_shape),
+        gripper_pose=_numpy(table.column("gripper_pose")),
+        records=records,
+        first_rows=first_rows,
+        lengths=np.diff(np.append(first_rows, table.num_rows)),
+    )
+
+
+def _numpy(column: pa.ChunkedArray) -> Any:
+    """Return a column as numpy: [N], or [N, width] for vectors and images; a view wherever Arrow allows one."""
+    array = column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks)
+    if pa.types.is_fixed_size_binary(array.type):
+        width = array.type.byte_width
+        flat = np.frombuffer(array.buffers()[1], np.uint8, len(array) * width, array.offset * width)
+        flat.flags.writeable = False
+        return flat.reshape(len(array), width)
+    if pa.types.is_fixed_size_list(array.type):
+        return array.flatten().to_numpy().reshape(len(array), array.type.list_size)
+    return array.to_numpy(zero_copy_only=False)

@@ -1,0 +1,285 @@
+"""Opens datasets and pools of shards, checking every file against its manifest before anything is read from it.
+
+A pool is what training reads: blocks of one task with the same images, action limits and discount, from any number of
+datasets.
+"""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from graspq.common.errors import UserError
+from graspq.common.files import sha256_of
+from graspq.datasets.blocks import REMEDY, BlockArrays, BlockRef, read_block
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
+
+HASHING_THREADS = 4
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset folder and its manifest."""
+
+    folder: Path
+    manifest: Manifest
+
+    @classmethod
+    def open(cls, folder: Path | str) -> "Dataset":
+        """Return the dataset in `folder`; its files are checked when they are read.
+
+        Raises:
+            UserError: the folder is no dataset, or its manifest is damaged.
+        """
+        return cls(Path(folder), Manifest.load(Path(folder)))
+
+    def pool(self, verify: bool = True) -> "ShardPool":
+        """Return all its shards; see `open_shards`."""
+        return _pool([(self, entry) for entry in self.manifest.shards], str(self.folder), verify)
+
+    def shard_pool(self, entry: ShardEntry, verify: bool = True) -> "ShardPool":
+        """Return one of its shards as a pool; see `open_shards`."""
+        return _pool([(self, entry)], str(self.folder), verify)
+
+    def episode_rows(self, entry: ShardEntry, verify: bool = True) -> list[dict[str, Any]]:
+        """Return the rows of a shard's episodes table, columns as in `schema.episodes_schema`.
+
+        Raises:
+            UserError: the file is missing or damaged.
+        """
+        path = episodes_file(entry.name)
+        check_file(self.folder, entry, path, verify)
+        try:
+            rows: list[dict[str, Any]] = pq.read_table(
+                self.folder / path, page_checksum_verification=True, use_threads=False, partitioning=None
+            ).to_pylist()
+        except (OSError, pa.ArrowException, ValueError) as error:
+            raise UserError(f"{self.folder / path}: cannot be read ({_one_line(error)}); {REMEDY}") from None
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class ShardPool:
+    """Blocks of one or more datasets that agree in task, image shape, action limits and discount.
+
+    Attributes:
+        blocks: ordered by seed of the dataset, then by number: the order in which they were named does not matter.
+        task: the task's settings as JSON.
+        image_shape: (H, W, C).
+        action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
+        discount: γ of the stored `mc_return`.
+        manifest_digest: that of the manifest where the pool is one whole dataset, else that of the shards' digests.
+    """
+
+    blocks: tuple[BlockRef, ...]
+    task: dict[str, Any]
+    image_shape: tuple[int, int, int]
+    action_limits: tuple[float, float, float, float]
+    discount: float
+    manifest_digest: str
+    _footers: dict[Path, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def rows(self) -> int:
+        """Number of steps."""
+        return sum(ref.rows for ref in self.blocks)
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return sum(ref.episodes for ref in self.blocks)
+
+    @property
+    def max_steps(self) -> int:
+        """T, the task's greatest number of steps."""
+        return int(self.task["max_steps"])
+
+    def read_block(self, ref: BlockRef) -> BlockArrays:
+        """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""
+        return read_block(ref, self.image_shape, self._footers.get(ref.path))
+
+    def split(self, validation_fraction: float, seed: int) -> tuple["ShardPool", "ShardPool"]:
+        """Return (training, held back): a block is held back with probability `validation_fraction`.
+
+        Whether it is depends on `seed` and the block's identity alone, so it stays so when the dataset is extended or
+        moved. A pool of more than one block gives at least one to each side, unless the fraction is 0.
+
+        Raises:
+            UserError: the fraction is outside [0, 1).
+        """
+        if not 0.0 <= validation_fraction < 1.0:
+            raise UserError(f"--validation-fraction: expected a number in [0, 1), got {validation_fraction}")
+        ranked = sorted(self.blocks, key=lambda ref: _fraction(seed, ref))
+        count = sum(_fraction(seed, ref) < validation_fraction for ref in ranked)
+        if validation_fraction > 0 and len(ranked) > 1:
+            count = min(max(count, 1), len(ranked) - 1)
+        elif len(ranked) == 1:
+            count = 0
+        held_back = set(ranked[:count])
+        return (
+            replace(self, blocks=tuple(ref for ref in self.blocks if ref not in held_back)),
+            replace(self, blocks=tuple(ref for ref in self.blocks if ref in held_back)),
+        )
+
+
+def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPool:
+    """Return the pool of all shards that the patterns name; a shard named twice counts once.
+
+    Args:
+        patterns: dataset folders, steps tables (`<dataset>/shards/*.parquet`), and globs of either.
+        verify: check the SHA-256 of every file now, besides its size; page checksums are verified on each read anyway.
+
+    Raises:
+        UserError: a pattern matches nothing, something is no dataset or is damaged, or datasets do not fit together.
+    """
+    if not patterns:
+        raise UserError("--shards: expected dataset folders, shard files or globs, got none")
+    found: dict[tuple[str, int], tuple[Dataset, ShardEntry]] = {}
+    opened: dict[Path, Dataset] = {}
+    for pattern in patterns:
+        for path in _matches(str(pattern)):
+            for dataset, entry in _entries(path, opened):
+                # By content: a copy of a shard under another name is the same shard.
+                found.setdefault((entry.files[steps_file(entry.name)], entry.first_block), (dataset, entry))
+    return _pool(list(found.values()), " ".join(map(str, patterns)), verify)
+
+
+def check_file(folder: Path, entry: ShardEntry, path: str, verify: bool) -> None:
+    """Check one file of a shard against the manifest: its size, and its SHA-256 where `verify` says so.
+
+    Raises:
+        UserError: the file is missing, of another size, or of other content.
+    """
+    full = folder / path
+    try:
+        size = full.stat().st_size
+    except OSError as error:
+        raise UserError(f"{full}: listed in the manifest but cannot be opened ({error.strerror}); {REMEDY}") from None
+    if size != entry.sizes[path]:
+        what = "truncated" if size < entry.sizes[path] else "too long"
+        raise UserError(f"{full}: {what}, {size} bytes instead of {entry.sizes[path]}; {REMEDY}")
+    if verify and sha256_of(full) != entry.files[path]:
+        raise UserError(f"{full}: damaged, its SHA-256 is not that of the manifest; {REMEDY}")
+
+
+def _matches(pattern: str) -> list[Path]:
+    path = Path(pattern).expanduser()
+    if path.exists():
+        return [path]
+    root = Path(path.anchor) if path.is_absolute() else Path()
+    matches = sorted(root.glob(str(path.relative_to(path.anchor) if path.is_absolute() else path)))
+    if not matches:
+        raise UserError(f"--shards: {pattern}: no such folder or file; expected a dataset folder, a shard or a glob")
+    return matches
+
+
+def _entries(path: Path, opened: dict[Path, Dataset]) -> Iterable[tuple[Dataset, ShardEntry]]:
+    if path.is_file():
+        folder = path.absolute().parent.parent
+    elif path.absolute().name == "shards" and not (path / MANIFEST_NAME).is_file():
+        folder = path.absolute().parent
+    else:
+        folder = path
+    key = folder.resolve()
+    if key not in opened:
+        opened[key] = Dataset.open(folder)
+    dataset = opened[key]
+    if path.is_dir():
+        return [(dataset, entry) for entry in dataset.manifest.shards]
+    inside = f"{path.absolute().parent.name}/{path.name}"
+    listed = [entry for entry in dataset.manifest.shards if steps_file(entry.name) == inside]
+    if not listed:
+        raise UserError(f"{path}: not a shard of {folder}: its manifest does not list {inside} as a steps table")
+    return [(dataset, listed[0])]
+
+
+def _pool(found: list[tuple[Dataset, ShardEntry]], named: str, verify: bool) -> ShardPool:
+    if not found:
+        raise UserError(f"{named}: the dataset has no finished shard yet; run the command that makes it again")
+    found = sorted(found, key=lambda pair: (_seed(pair[0]), pair[1].first_block, sorted(pair[1].files.values())))
+    _check_agreement([dataset for dataset, _ in found])
+    with ThreadPoolExecutor(HASHING_THREADS) as executor:
+        list(executor.map(lambda pair: check_file(pair[0].folder, pair[1], steps_file(pair[1].name), verify), found))
+    footers = {dataset.folder / steps_file(entry.name): _footer(dataset, entry) for dataset, entry in found}
+    manifest = found[0][0].manifest
+    whole = len(found) == len(manifest.shards) and len({id(dataset) for dataset, _ in found}) == 1
+    digests = "".join(entry.files[steps_file(entry.name)] for _, entry in found)
+    return ShardPool(
+        blocks=tuple(ref for dataset, entry in found for ref in _refs(dataset, entry, footers)),
+        task=manifest.task,
+        image_shape=manifest.image_shape,
+        action_limits=manifest.action_limits,
+        discount=manifest.discount,
+        manifest_digest=manifest.digest() if whole else hashlib.sha256(digests.encode()).hexdigest(),
+        _footers=footers,
+    )
+
+
+def _footer(dataset: Dataset, entry: ShardEntry) -> Any:
+    path = dataset.folder / steps_file(entry.name)
+    try:
+        footer = pq.read_metadata(path)
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise UserError(f"{path}: not a readable Parquet file ({_one_line(error)}); {REMEDY}") from None
+    if footer.num_row_groups != entry.blocks or footer.num_rows != entry.rows:
+        raise UserError(
+            f"{path}: expected {entry.blocks} blocks with {entry.rows} rows, "
+            f"got {footer.num_row_groups} with {footer.num_rows}; {REMEDY}"
+        )
+    return footer
+
+
+def _refs(dataset: Dataset, entry: ShardEntry, footers: dict[Path, Any]) -> list[BlockRef]:
+    path = dataset.folder / steps_file(entry.name)
+    size = dataset.manifest.block_size
+    return [
+        BlockRef(
+            path=path,
+            row_group=index,
+            block=block,
+            rows=footers[path].row_group(index).num_rows,
+            episodes=min(size, entry.episodes - index * size),
+            key=f"{dataset.manifest.task_name}/{_seed(dataset)}/{block}",
+        )
+        for index, block in enumerate(entry.block_range)
+    ]
+
+
+def _check_agreement(datasets: list[Dataset]) -> None:
+    first = datasets[0]
+    for other in datasets[1:]:
+        for what, name in (
+            ("tasks", "task_name"),
+            ("image shapes", "image_shape"),
+            ("action limits", "action_limits"),
+            ("discounts", "discount"),
+        ):
+            ours, theirs = getattr(first.manifest, name), getattr(other.manifest, name)
+            if ours != theirs:
+                raise UserError(
+                    f"--shards: cannot mix {what}: {first.folder} has {_shown(ours)}, "
+                    f"{other.folder} has {_shown(theirs)}; train on one of them"
+                )
+
+
+def _shown(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _seed(dataset: Dataset) -> str:
+    return str(dataset.manifest.settings.get("seed", ""))
+
+
+def _fraction(seed: int, ref: BlockRef) -> float:
+    """Return a number in [0, 1) that depends on the seed and the block's identity alone."""
+    digest = hashlib.sha256(f"held back/{seed}/{ref.key}".encode()).digest()
+    return int.from_bytes(digest[:6], "little") / 2**48
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())

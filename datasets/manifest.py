@@ -1,0 +1,228 @@
+"""The manifest of a dataset: what it was made with and which shards exist, with the SHA-256 of every file.
+
+What is not in the manifest does not exist. It carries its own digest, and holds no times, hosts or worker counts.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.files import read_json, write_json
+
+FORMAT_VERSION = 1
+MANIFEST_NAME = "manifest.json"
+SHARD_NAME = re.compile(r"blocks-\d{6,}-\d{6,}(-short-\d+)?")
+REMEDY = "copy the dataset again, or make it again with the command that made it"
+
+
+def shard_name(first_block: int, blocks: int, episodes: int, block_size: int) -> str:
+    """Return a shard's name, `blocks-<first>-<last>`; with a short last block also the number of its episodes.
+
+    A short shard that is extended thereby gets a new name, and never replaces a file that the manifest still lists.
+    """
+    name = f"blocks-{first_block:06d}-{first_block + blocks - 1:06d}"
+    return name if episodes == blocks * block_size else f"{name}-short-{episodes}"
+
+
+def steps_file(name: str) -> str:
+    """Return the path of a shard's steps table within its dataset."""
+    return f"shards/{name}.parquet"
+
+
+def episodes_file(name: str) -> str:
+    """Return the path of a shard's episodes table within its dataset."""
+    return f"episodes/{name}.parquet"
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """One committed shard.
+
+    Attributes:
+        name: see `shard_name`.
+        first_block: number of its first block.
+        blocks: number of its blocks, which is the number of row groups of its steps table.
+        episodes: number of its episodes.
+        rows: number of its steps.
+        successes: number of its successful episodes.
+        seeds: seeds of its first and last episode.
+        files: path within the dataset → SHA-256.
+        sizes: path within the dataset → bytes.
+    """
+
+    name: str
+    first_block: int
+    blocks: int
+    episodes: int
+    rows: int
+    successes: int
+    seeds: tuple[int, int]
+    files: dict[str, str]
+    sizes: dict[str, int]
+
+    def __post_init__(self) -> None:
+        expected = {steps_file(self.name), episodes_file(self.name)}
+        if SHARD_NAME.fullmatch(self.name) is None or set(self.files) != expected or set(self.sizes) != expected:
+            raise ValueError(f"shard {self.name!r}: expected the files {sorted(expected)}")
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of its files together."""
+        return sum(self.sizes.values())
+
+    @property
+    def block_range(self) -> range:
+        """Numbers of its blocks."""
+        return range(self.first_block, self.first_block + self.blocks)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A dataset's description and its shards.
+
+    Attributes:
+        task: the task's settings as JSON; `task["name"]` is its name.
+        settings: the collection's settings as JSON, all that determines the bytes; `"block_size"` is read here.
+        versions: package → version, of what can change the bytes.
+        object_set: `name` and `sha256`, the digest of `objects/object_set.json`.
+        image_shape: (H, W, 3).
+        action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
+        discount: γ of the stored `mc_return`.
+        phi_range: least and greatest unwrapped wrist angle φ, radians.
+        shards: ordered by first block, disjoint.
+        files: SHA-256 of the other files that belong to it, such as `README.md`.
+    """
+
+    task: dict[str, Any]
+    settings: dict[str, Any]
+    versions: dict[str, str]
+    object_set: dict[str, Any]
+    image_shape: tuple[int, int, int]
+    action_limits: tuple[float, float, float, float]
+    discount: float
+    phi_range: tuple[float, float]
+    shards: tuple[ShardEntry, ...] = ()
+    files: dict[str, str] = field(default_factory=dict)
+    format_version: int = FORMAT_VERSION
+
+    def __post_init__(self) -> None:
+        following = 0
+        for entry in self.shards:
+            if entry.first_block < following:
+                raise ValueError(f"shard {entry.name}: its blocks overlap or are out of order")
+            following = entry.first_block + entry.blocks
+
+    @property
+    def block_size(self) -> int:
+        """Episodes of a whole block."""
+        return int(self.settings["block_size"])
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes in all shards."""
+        return sum(entry.episodes for entry in self.shards)
+
+    @property
+    def rows(self) -> int:
+        """Number of steps in all shards."""
+        return sum(entry.rows for entry in self.shards)
+
+    @property
+    def successes(self) -> int:
+        """Number of successful episodes in all shards."""
+        return sum(entry.successes for entry in self.shards)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all shards' files."""
+        return sum(entry.bytes for entry in self.shards)
+
+    @property
+    def task_name(self) -> str:
+        """Name of the task."""
+        return str(self.task["name"])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values, without the digest."""
+        values = {name.name: getattr(self, name.name) for name in dataclasses.fields(self)}
+        values["shards"] = [dataclasses.asdict(entry) for entry in self.shards]
+        ordered = {"format_version": values.pop("format_version")} | values
+        result: dict[str, Any] = json.loads(json.dumps(ordered, allow_nan=False))
+        return result
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the manifest's content, 64 hexadecimal digits."""
+        return self._digest
+
+    @functools.cached_property
+    def _digest(self) -> str:
+        return _digest_of(self.to_json())
+
+    def save(self, folder: Path) -> None:
+        """Write `manifest.json` atomically and durably; the same manifest gives the same bytes."""
+        write_json(folder / MANIFEST_NAME, {**self.to_json(), "digest": self.digest()})
+
+    @classmethod
+    def load(cls, folder: Path) -> "Manifest":
+        """Return the manifest of the dataset in `folder`.
+
+        Raises:
+            UserError: there is none, it is damaged, or it is of another format version.
+        """
+        path = folder / MANIFEST_NAME
+        if not folder.is_dir():
+            raise UserError(f"{folder}: no such dataset folder; make one with `make data` or `grasp-datagen`")
+        if not path.is_file():
+            raise UserError(
+                f"{folder}: not a dataset, it has no {MANIFEST_NAME}; expected a folder that `make data` made"
+            )
+        values = read_json(path, "dataset manifest")
+        if not isinstance(values, dict) or "format_version" not in values:
+            raise UserError(f"{path}: not a dataset manifest; {REMEDY}")
+        if values["format_version"] != FORMAT_VERSION and values.get("digest") == _digest_without(values):
+            raise UserError(
+                f"{path}: format version {values['format_version']}, expected {FORMAT_VERSION}; use another graspq"
+            )
+        return cls._checked(path, values)
+
+    @classmethod
+    def _checked(cls, path: Path, values: dict[str, Any]) -> "Manifest":
+        # The bytes are compared, not only the content, so that no flipped bit passes, not even one in white space.
+        rendered = json.dumps(values, indent=2, ensure_ascii=False, allow_nan=True) + "\n"
+        if values.get("digest") != _digest_without(values) or path.read_bytes() != rendered.encode():
+            raise UserError(f"{path}: damaged or edited, its content does not match its own digest; {REMEDY}")
+        try:
+            return cls.from_json({name: value for name, value in values.items() if name != "digest"})
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{path}: not a dataset manifest of this version ({error}); {REMEDY}") from None
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Manifest":
+        """Return the manifest that `to_json` wrote.
+
+        Raises:
+            KeyError, TypeError, ValueError: the values are not those of a manifest.
+        """
+        shards = tuple(ShardEntry(**{**entry, "seeds": tuple(entry["seeds"])}) for entry in values["shards"])
+        tuples = {name: tuple(values[name]) for name in ("image_shape", "action_limits", "phi_range")}
+        return cls(**{**values, **tuples, "shards": shards})
+
+    def with_shard(self, entry: ShardEntry) -> "Manifest":
+        """Return the manifest with `entry` added; it takes the place of one that starts at the same block."""
+        others = [other for other in self.shards if other.first_block != entry.first_block]
+        shards = sorted([*others, entry], key=lambda shard: shard.first_block)
+        return dataclasses.replace(self, shards=tuple(shards))
+
+
+def _digest_without(values: dict[str, Any]) -> str:
+    return _digest_of({name: value for name, value in values.items() if name != "digest"})
+
+
+def _digest_of(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, ensure_ascii=False, separators=(",", ":")).encode()).hexdigest()

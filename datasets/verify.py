@@ -1,0 +1,190 @@
+"""Verifies a dataset: every byte against the manifest, every label against the rewards and poses it comes from.
+
+A single flipped bit in any file of the dataset is found, whichever file it is in.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from graspq.common.errors import UserError
+from graspq.common.files import read_json, sha256_of
+from graspq.datasets.blocks import BlockArrays, BlockRef, read_block
+from graspq.datasets.dataset import Dataset, check_file
+from graspq.datasets.labels import mc_return, synthetic_action
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
+from graspq.datasets.schema import episodes_schema, steps_schema
+
+OBJECT_SET = "objects/object_set.json"
+Progress = Callable[[int], Any]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `verify` found.
+
+    Attributes:
+        faults: one line each; none means that the dataset is what its manifest says.
+        notes: one line each, of what is no fault: files that do not belong to it, blocks not collected yet.
+        files: number of files that were checked.
+        bytes: their bytes.
+    """
+
+    faults: tuple[str, ...]
+    notes: tuple[str, ...]
+    files: int
+    bytes: int
+
+
+def verify(folder: Path | str, progress: Progress = lambda _: None) -> Report:
+    """Check a whole dataset.
+
+    Args:
+        folder: the dataset.
+        progress: called with the bytes of each shard that has been checked; `Manifest.bytes` in all.
+
+    Raises:
+        UserError: the folder is no dataset, or its manifest is damaged.
+    """
+    folder = Path(folder)
+    dataset = Dataset.open(folder)
+    manifest = dataset.manifest
+    faults = [*_named_files(folder, manifest), *_object_files(folder, manifest)]
+    following = 0
+    for entry in manifest.shards:
+        faults += _shard(dataset, entry)
+        progress(entry.bytes)
+    belonging = _belonging(folder, manifest)
+    present = [path for path in belonging if (folder / path).is_file()]
+    notes = [f"{folder / path}: not part of the dataset, no manifest lists it" for path in _others(folder, belonging)]
+    for entry in manifest.shards:
+        if entry.first_block != following:
+            notes.append(f"{folder}: blocks {following} to {entry.first_block - 1} are not there (yet)")
+        following = entry.first_block + entry.blocks
+    return Report(tuple(faults), tuple(notes), len(present), sum((folder / path).stat().st_size for path in present))
+
+
+def _named_files(folder: Path, manifest: Manifest) -> Iterator[str]:
+    for path, digest in manifest.files.items():
+        yield from _checked(folder / path, digest)
+
+
+def _object_files(folder: Path, manifest: Manifest) -> Iterator[str]:
+    faults = list(_checked(folder / OBJECT_SET, str(manifest.object_set.get("sha256"))))
+    yield from faults
+    if not faults:
+        for path, digest in _object_digests(folder).items():
+            yield from _checked(folder / path, digest)
+
+
+def _object_digests(folder: Path) -> dict[str, str]:
+    """Return path within the dataset → SHA-256 of all files that the object set lists."""
+    try:
+        listed = read_json(folder / OBJECT_SET, "object set")["objects"]
+        records = listed.values() if isinstance(listed, dict) else listed
+        return {f"objects/{name}": digest for record in records for name, digest in record["sha256"].items()}
+    except (UserError, AttributeError, KeyError, TypeError):
+        return {}
+
+
+def _checked(path: Path, digest: str) -> Iterator[str]:
+    try:
+        if sha256_of(path) != digest:
+            yield f"{path}: damaged, its SHA-256 is not the one listed"
+    except OSError as error:
+        yield f"{path}: listed but cannot be read ({error.strerror})"
+
+
+def _belonging(folder: Path, manifest: Manifest) -> set[str]:
+    shards = {path for entry in manifest.shards for path in entry.files}
+    return {MANIFEST_NAME, OBJECT_SET, *manifest.files, *shards, *_object_digests(folder)}
+
+
+def _others(folder: Path, belonging: set[str]) -> list[str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return sorted(name for path in files if (name := path.relative_to(folder).as_posix()) not in belonging)
+
+
+def _shard(dataset: Dataset, entry: ShardEntry) -> Iterator[str]:
+    """Yield the faults of one shard; its content is compared only where its bytes are right."""
+    intact = True
+    for path in entry.files:
+        try:
+            check_file(dataset.folder, entry, path, verify=True)
+        except UserError as error:
+            intact = False
+            yield error.message.rsplit("; ", 1)[0] + _where(dataset, entry, path)
+    if intact:
+        try:
+            yield from _content(dataset, entry)
+        except (UserError, OSError, pa.ArrowException, KeyError, ValueError) as error:
+            yield f"{dataset.folder / steps_file(entry.name)}: not the tables expected ({error})"
+
+
+def _where(dataset: Dataset, entry: ShardEntry, path: str) -> str:
+    """Say which blocks of a damaged steps table fail their page checksums."""
+    if path != steps_file(entry.name):
+        return ""
+    failed = []
+    try:
+        with pq.ParquetFile(dataset.folder / path, page_checksum_verification=True) as file:
+            for index, block in enumerate(entry.block_range):
+                try:
+                    file.read_row_group(index, use_threads=False)
+                except (OSError, pa.ArrowException):
+                    failed.append(str(block))
+    except (OSError, pa.ArrowException):
+        return ""
+    return f" (block {', '.join(failed)})" if failed else ""
+
+
+def _content(dataset: Dataset, entry: ShardEntry) -> Iterator[str]:
+    manifest, path = dataset.manifest, dataset.folder / steps_file(entry.name)
+    rows = dataset.episode_rows(entry, verify=False)
+    episodes_path = dataset.folder / episodes_file(entry.name)
+    for table, expected in ((path, steps_schema(manifest)), (episodes_path, episodes_schema(manifest))):
+        if not pq.read_schema(table).equals(expected, check_metadata=True):
+            yield f"{table}: its columns or their metadata are not those of the manifest"
+            return
+    blocks = [row["block"] for row in rows]
+    counts = (len(rows), sum(row["steps"] for row in rows), sum(row["success"] for row in rows))
+    if counts != (entry.episodes, entry.rows, entry.successes) or sorted(set(blocks)) != list(entry.block_range):
+        yield f"{episodes_path}: its episodes, steps, successes or blocks are not those of the manifest"
+        return
+    if (rows[0]["seed"], rows[-1]["seed"]) != tuple(entry.seeds):
+        yield f"{episodes_path}: its seeds are not those of the manifest"
+    ids = [row["episode_id"] for row in rows]
+    if ids != list(range(ids[0], ids[0] + len(ids))) or blocks != sorted(blocks):
+        yield f"{episodes_path}: its episodes are out of order"
+    footer = pq.read_metadata(path)
+    for index, block in enumerate(entry.block_range):
+        episodes = [row for row in rows if row["block"] == block]
+        ref = BlockRef(path, index, block, footer.row_group(index).num_rows, len(episodes), "")
+        yield from (f"{path}: block {block}: {fault}" for fault in _block(manifest, ref, episodes))
+
+
+def _block(manifest: Manifest, ref: BlockRef, episodes: list[dict[str, Any]]) -> Iterator[str]:
+    arrays = read_block(ref, manifest.image_shape)
+    if arrays.lengths.tolist() != [row["steps"] for row in episodes]:
+        yield "the lengths of its episodes are not those of the episodes table"
+        return
+    for number, row in enumerate(episodes):
+        yield from (f"episode {row['episode_id']}: {fault}" for fault in _episode(manifest, arrays, number, row))
+
+
+def _episode(manifest: Manifest, arrays: BlockArrays, number: int, row: dict[str, Any]) -> Iterator[str]:
+    rows = slice(int(arrays.first_rows[number]), int(arrays.first_rows[number] + arrays.lengths[number]))
+    records = arrays.records[rows]
+    if (records["episode_id"] != row["episode_id"]).any() or (records["step"] != np.arange(len(records))).any():
+        yield "its steps are out of order"
+    if not np.array_equal(records["mc_return"], mc_return(records["reward"], manifest.discount)):
+        yield "mc_return is not the return of its rewards"
+    final_pose = np.asarray(row["final_pose"], np.float32)
+    expected = synthetic_action(arrays.gripper_pose[rows], final_pose, manifest.action_limits)
+    if not np.array_equal(records["synthetic_action"], expected):
+        yield "synthetic_action is not that of its poses"

@@ -1,0 +1,91 @@
+"""`grasp-eval`: score runs, the random policy, the oracle and users' policies on scenes that no training has seen.
+
+The way on: `jobs` (what to do) -> `batch` (one after the other) -> `evaluation` -> `rollout` and `policies`.
+"""
+
+from pathlib import Path
+
+import click
+
+from graspq.common.errors import UserError
+from graspq.common.options import Command, options_from, with_version
+from graspq.evaluate.settings import EvalSettings
+
+RESULTS = Path("runs/evaluations")
+
+
+@click.command(cls=Command, name="grasp-eval")
+@with_version
+@options_from(EvalSettings)
+def main(settings: EvalSettings) -> int:
+    """Score policies in simulation on held-out objects.
+
+    Each RUN is a folder of grasp-train (or a glob of them); its last checkpoint acts by the cross-entropy method.
+    Every policy meets the same scenes, and a result does not depend on the number of workers. Each evaluation is a
+    folder with eval.json, episodes.jsonl and films.npz; several jobs also give one table, results.jsonl and
+    results.csv. A job that is finished is not run again.
+
+    \b
+    Examples:
+      grasp-eval runs/mc --episodes 1000
+      grasp-eval 'runs/*' --policy random --policy oracle --out runs/scores
+      grasp-eval --policy my_policy:make --objects data/objects/regular
+      grasp-eval --jobs jobs.toml
+    """
+    return evaluate(settings)
+
+
+def evaluate(settings: EvalSettings) -> int:
+    """Run the jobs that the settings describe; return the exit status: 0, or 1 if a job failed.
+
+    Raises:
+        UserError: the settings describe no jobs, or the only job cannot be run.
+    """
+    from graspq.evaluate.batch import make_plan, plan_table, run_plan
+    from graspq.evaluate.jobs import jobs_from_settings
+
+    jobs = jobs_from_settings(settings)
+    several = len(jobs) > 1
+    if settings.video is not None:
+        _check_video(settings, several)
+    entries = make_plan(jobs, settings)
+    if several or settings.plan:
+        click.echo(plan_table(entries))
+    if settings.plan:
+        return int(any(entry.prepared is None for entry in entries))
+    table = settings.out if settings.out is not None else _results_folder(settings) if several else None
+    results = run_plan(entries, settings, table)
+    if table is not None:
+        click.echo(f"results: {(table / 'results.csv').as_posix()}")
+    if settings.video is not None and entries[0].prepared is not None:
+        _write_video(settings, entries[0].prepared)
+    return int(any(result.evaluation is None for result in results))
+
+
+def _results_folder(settings: EvalSettings) -> Path:
+    return RESULTS / settings.jobs.stem if settings.jobs is not None else RESULTS
+
+
+def _check_video(settings: EvalSettings, several: bool) -> None:
+    from graspq.evaluate.video import check_video_path
+
+    assert settings.video is not None
+    if several:
+        raise UserError("--video: one job makes one video; name one run or one policy")
+    check_video_path(settings.video)
+
+
+def _write_video(settings: EvalSettings, prepared: "object") -> None:
+    from graspq.evaluate.evaluation import Prepared, stage_of
+    from graspq.evaluate.video import write_video
+
+    assert isinstance(prepared, Prepared) and settings.video is not None
+    successes = write_video(
+        settings.video,
+        stage_of(prepared),
+        prepared.policy,
+        episodes=min(settings.video_episodes, prepared.job.episodes),
+        environments=prepared.job.environments,
+        size=settings.video_size,
+    )
+    click.echo(f"video: {settings.video} ({sum(successes)} of {len(successes)} grasps succeed in it)")

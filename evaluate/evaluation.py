@@ -1,0 +1,247 @@
+"""One evaluation from job to files: what it needs is found and checked first, then it runs, then it is written.
+
+The scenes follow from the job; `eval.json` holds no times and no hosts, so the same job gives the same file.
+"""
+
+import contextlib
+import json
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graspq.common.errors import UserError
+from graspq.common.files import writable_folder
+from graspq.common.provenance import code_revision, versions
+from graspq.evaluate.films import write_films
+from graspq.evaluate.jobs import Job
+from graspq.evaluate.object_sets import find_object_set
+from graspq.evaluate.policies import CEM, ORACLE, RANDOM, Policy, RandomObservationPolicy, UserPolicy
+from graspq.evaluate.records import (
+    EPISODES_FILE,
+    FORMAT_VERSION,
+    EpisodeRow,
+    Evaluation,
+    identity_digest,
+    write_rows,
+    write_summary,
+)
+from graspq.evaluate.settings import CemSettings, EvalSettings
+from graspq.evaluate.statistics import wilson_interval
+
+if TYPE_CHECKING:
+    from graspq.evaluate.runs import RunFacts
+    from graspq.objects.object_set import ObjectSet
+    from graspq.sim.task import TaskSettings
+
+BASELINES = Path("runs/baselines")
+PACKAGES = ("numpy", "pybullet", "torch")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A job whose run, task and object set are found.
+
+    Attributes:
+        job: the job.
+        task: settings of its task.
+        objects: its object set, verified.
+        facts: what the run's folder says; None without a run.
+        policy: who decides; None for the oracle.
+        identity: all that determines the result; the same identity is the same job.
+        folder: where its files are or will be.
+        finished: the evaluation, if it is there already.
+    """
+
+    job: Job
+    task: "TaskSettings"
+    objects: "ObjectSet"
+    facts: "RunFacts | None"
+    policy: Policy | None
+    identity: dict[str, Any]
+    folder: Path
+    finished: Evaluation | None
+
+
+def prepare(job: Job, settings: EvalSettings, others: Iterable[Path] = ()) -> Prepared:
+    """Find everything that a job needs.
+
+    Args:
+        job: the job.
+        settings: of the command.
+        others: folders of object sets that other jobs use.
+
+    Raises:
+        UserError: PyBullet, the run, its checkpoint, the task, the object set, its split or the policy is not there.
+    """
+    _check_simulator()
+    from graspq.sim.task import TaskSettings, draw_objects, task_settings
+
+    policy, facts = _policy(job, settings)
+    name = job.task or (str(facts.task["name"]) if facts is not None else "regular")
+    if facts is not None and facts.task["name"] == name:
+        task = TaskSettings.from_json(facts.task)
+        objects = find_object_set(name, job.objects, facts.object_set, facts.datasets, others)
+    else:
+        task = task_settings(name)
+        objects = find_object_set(name, job.objects, None, (), others)
+    _check_fit(job, facts, task)
+    draw_objects(task, objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
+    identity = {
+        "task": task.to_json(),
+        "split": job.split,
+        "seed": job.seed,
+        "episodes": job.episodes,
+        "environments": job.environments,
+        "object_set": objects.digest(),
+        "policy": job.policy,
+        "network": facts.network_sha256 if facts is not None else None,
+        **(policy.identity() if policy is not None else {}),
+    }
+    folder, finished = _place(job, name, settings.out, identity)
+    return Prepared(job, task, objects, facts, policy, identity, folder, finished)
+
+
+def _check_simulator() -> None:
+    import importlib.util
+
+    if importlib.util.find_spec("pybullet") is None:
+        raise UserError("evaluation needs the simulator, and PyBullet is not installed; run: pip install 'graspq[sim]'")
+
+
+def _policy(job: Job, settings: EvalSettings) -> "tuple[Policy | None, RunFacts | None]":
+    if job.run is not None:
+        from graspq.evaluate.runs import load_run
+
+        return load_run(job.run, job.checkpoint, job.cem, settings.device)
+    assert job.policy is not None
+    if job.policy == ORACLE:
+        return None, None
+    return RandomObservationPolicy() if job.policy == RANDOM else UserPolicy.load(job.policy), None
+
+
+def _check_fit(job: Job, facts: "RunFacts | None", task: "TaskSettings") -> None:
+    """Refuse a network that was trained on other images or actions than the task's."""
+    if facts is None:
+        return
+    shape = (task.image_size, task.image_size, 3)
+    pairs = (
+        ("images", facts.image_shape, shape),
+        ("action limits", facts.action_limits, tuple(task.action_limits)),
+        ("steps", facts.steps, task.max_steps),
+    )
+    for what, run, here in pairs:
+        if run != here:
+            raise UserError(
+                f"{job.run}: trained with {what} {run}, the {task.name} task has {here}; name its own --task"
+            )
+
+
+def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any]) -> tuple[Path, Evaluation | None]:
+    """Return the job's folder, and its evaluation if it is finished; another job's evaluation is never overwritten."""
+    name = f"{task}-{job.split}-seed{job.seed}-{job.episodes}"
+    if out is not None or job.run is None:
+        parent, name = out if out is not None else BASELINES, f"{job.label.replace(':', '.')}-{name}"
+    else:
+        parent = job.run / "evaluations"
+    first = parent / name
+    found = _evaluation_in(first)
+    if found is None or found.summary["job"] == identity:
+        return first, found
+    second = parent / f"{name}-{identity_digest(identity)[:8]}"
+    return second, _evaluation_in(second)
+
+
+def _evaluation_in(folder: Path) -> Evaluation | None:
+    try:
+        found = Evaluation.load(folder)
+    except UserError:
+        return None
+    return found if found.has(EPISODES_FILE) else None
+
+
+def run_prepared(
+    prepared: Prepared, settings: EvalSettings, on_row: Callable[[EpisodeRow], None] | None = None
+) -> Evaluation:
+    """Run a prepared job and write its files.
+
+    Raises:
+        UserError: the folder cannot be written, or a user's policy fails.
+        RolloutError: an episode ends its simulator each time.
+    """
+    from graspq.evaluate.rollout import run_episodes
+
+    job = prepared.job
+    folder = writable_folder(prepared.folder, "evaluation")
+    try:
+        rows, films = run_episodes(
+            stage_of(prepared),
+            prepared.policy,
+            episodes=job.episodes,
+            environments=job.environments,
+            workers=settings.workers,
+            films=settings.films,
+            on_row=on_row,
+        )
+    except BaseException:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # only if it is empty: nothing of an unfinished evaluation stays
+        raise
+    write_rows(folder, rows)
+    write_films(folder, films.chosen())
+    return write_summary(folder, _summary(prepared, rows))
+
+
+def stage_of(prepared: Prepared) -> Any:
+    """Return what the workers need to know of a job."""
+    from graspq.evaluate.workers import Stage
+
+    job = prepared.job
+    return Stage(prepared.task, str(prepared.objects.folder), job.split, job.seed, job.policy == ORACLE)
+
+
+def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
+    job, facts = prepared.job, prepared.facts
+    successes = sum(row.success for row in rows)
+    return {
+        "format_version": FORMAT_VERSION,
+        "label": job.label,
+        "task": prepared.task.name,
+        "split": job.split,
+        "episodes": len(rows),
+        "successes": successes,
+        "success_rate": successes / len(rows),
+        "ci95": list(wilson_interval(successes, len(rows))),
+        "mean_steps": float(np.mean([row.steps for row in rows])),
+        "mean_return": float(np.mean([row.episode_return for row in rows])),
+        "ends": {end: sum(row.end == end for row in rows) for end in ("height", "T")},
+        "policy": job.policy or CEM,
+        "run": job.run.as_posix() if job.run is not None else None,
+        "algo": facts.algo if facts is not None else None,
+        "checkpoint_step": facts.step if facts is not None else None,
+        "seed": job.seed,
+        "object_set": {"name": prepared.objects.name, "sha256": prepared.objects.digest()},
+        "cem": job.cem.to_json() if job.run is not None else None,
+        "command": command_of(job),
+        "versions": versions(*PACKAGES),
+        "code_revision": code_revision(),
+        "job": json.loads(json.dumps(prepared.identity)),
+    }
+
+
+def command_of(job: Job) -> str:
+    """Return the command line that makes an evaluation again; options at their defaults are left out."""
+    words = ["grasp-eval", *([job.run.as_posix()] if job.run is not None else ["--policy", str(job.policy)])]
+    words += ["--task", job.task] if job.task is not None else []
+    words += ["--split", job.split, "--episodes", str(job.episodes), "--seed", str(job.seed)]
+    words += ["--objects", job.objects.as_posix()] if job.objects is not None else []
+    words += ["--checkpoint", str(job.checkpoint)] if job.checkpoint is not None else []
+    words += ["--environments", str(job.environments)] if job.environments != EvalSettings.environments else []
+    usual = CemSettings()
+    for name, value in job.cem.to_json().items():
+        if value != getattr(usual, name):
+            words += [f"--cem-{name}", str(value)]
+    return shlex.join(words)

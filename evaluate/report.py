@@ -1,0 +1,146 @@
+"""One self-contained HTML page that shows runs and evaluations: success, learning, calibration, films, settings.
+
+Python prepares numbers, coordinates and sentences; `templates/report.html` alone knows how they look.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jinja2
+
+import graspq
+from graspq.common.errors import UserError
+from graspq.common.files import write_text
+from graspq.evaluate.charts import PLOT
+from graspq.evaluate.policies import ORACLE, RANDOM
+from graspq.evaluate.report_data import Findings, RunData, Score, gather
+from graspq.evaluate.report_figures import calibration_charts, film_groups, learning_curves
+from graspq.evaluate.report_tables import (
+    command_lines,
+    evaluation_row,
+    interval_text,
+    panel_of,
+    percent,
+    set_name,
+    settings_table,
+    version_rows,
+)
+
+PALETTE = 8  # colours of candidates; the two after them are the references'
+
+
+def write_report(
+    folders: Sequence[Path], out: Path, *, title: str | None = None, baselines: Path | None = None
+) -> None:
+    """Write a report on the runs and evaluations in some folders, atomically.
+
+    Args:
+        folders: see `report_data.gather`.
+        out: the HTML file.
+        title: heading; a sentence on the best result by default.
+        baselines: where else to look for evaluations of the random policy and the oracle.
+
+    Raises:
+        UserError: a folder holds nothing to report on, or the page cannot be written.
+    """
+    page = render(gather(folders, baselines), title)
+    try:
+        write_text(out, page)
+    except OSError as error:
+        raise UserError(f"{out}: cannot write the report here ({error.strerror}); choose another --out") from None
+
+
+def render(findings: Findings, title: str | None = None) -> str:
+    """Return the page for what was found."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("graspq.evaluate"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    colors = _colors(findings)
+    first = next(iter(findings.panels.values()), [])
+    headline = title or _headline(first, findings.runs)
+    return environment.get_template("report.html").render(
+        title=f"graspq: {headline}",
+        headline=headline,
+        lead=_lead(first),
+        cards=_cards(findings, first),
+        panels=[panel_of(key, scores, findings.runs, colors) for key, scores in findings.panels.items()],
+        curves=learning_curves(findings.runs, colors),
+        calibration=calibration_charts(findings, colors),
+        films=film_groups(findings),
+        evaluations=[
+            evaluation_row(score, one)
+            for scores in findings.panels.values()
+            for score in scores
+            for one in score.evaluations
+        ],
+        settings=settings_table(findings.runs),
+        commands=command_lines(findings),
+        versions=version_rows(findings),
+        version=graspq.__version__,
+        plot=PLOT,
+    )
+
+
+def _colors(findings: Findings) -> dict[str, int]:
+    names = [run.name for run in findings.runs]
+    names += [score.name for scores in findings.panels.values() for score in scores if not score.is_reference]
+    return {name: index % PALETTE for index, name in enumerate(dict.fromkeys(names))}
+
+
+def _best(scores: Sequence[Score]) -> Score | None:
+    return max((score for score in scores if not score.is_reference), key=lambda score: score.rate, default=None)
+
+
+def _reference(scores: Sequence[Score], policy: str) -> Score | None:
+    return next((score for score in scores if score.policy == policy), None)
+
+
+def _headline(scores: Sequence[Score], runs: Sequence[RunData]) -> str:
+    best = _best(scores)
+    if best is not None:
+        held_out = best.evaluations[0].summary["split"].startswith("test")
+        return f"{best.name} succeeds in {percent(best.rate)} of {'held-out' if held_out else 'training'} grasps"
+    if runs:
+        return f"Training of {', '.join(run.name for run in runs[:4])}" + (" and others" if len(runs) > 4 else "")
+    return "Evaluation of the baselines"
+
+
+def _lead(scores: Sequence[Score]) -> str:
+    if not scores:
+        return (
+            "Vision-based grasping in simulation with off-policy Q-function estimators. No policy has been scored yet."
+        )
+    summary = scores[0].evaluations[0].summary
+    sentence = (
+        f"The {summary['task']} grasping task on the {summary['split']} split of the {set_name(summary)} object set."
+    )
+    random, oracle = _reference(scores, RANDOM), _reference(scores, ORACLE)
+    if random is not None:
+        sentence += f" The random policy, which collected the data, succeeds in {percent(random.rate)}"
+        sentence += (
+            f"; the scripted oracle, which knows poses and meshes, in {percent(oracle.rate)}." if oracle else "."
+        )
+    elif oracle is not None:
+        sentence += f" The scripted oracle, which knows poses and meshes, succeeds in {percent(oracle.rate)}."
+    return sentence
+
+
+def _cards(findings: Findings, scores: Sequence[Score]) -> list[dict[str, str]]:
+    best, cards = _best(scores), []
+    shown = [("Best estimator" if best is not None else "", best), ("Random policy", _reference(scores, RANDOM))]
+    for name, score in [*shown, ("Scripted oracle", _reference(scores, ORACLE))]:
+        if score is not None:
+            detail = f"{score.name + ', ' if score is best else ''}95 %: {interval_text(*score.interval)}"
+            cards.append({"name": name, "number": percent(score.rate), "detail": detail})
+    episodes = sum(int(one.summary["episodes"]) for one in findings.evaluations)
+    if episodes > 0:
+        cards.append({"name": "Episodes scored", "number": f"{episodes:,}", "detail": "grasps in simulation"})
+    if findings.runs:
+        steps = max((row.get("step", 0) for run in findings.runs for row in run.metrics), default=0)
+        cards.append(
+            {"name": "Runs", "number": f"{len(findings.runs)}", "detail": f"of up to {steps:,} training steps"}
+        )
+    return cards

@@ -1,0 +1,178 @@
+"""The tables of a report, and its bars: success, differences, seeds, evaluations, settings, commands, versions.
+
+Each function turns findings into the words and numbers that the template sets.
+"""
+
+import json
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.options import flag
+from graspq.evaluate.policies import ORACLE, RANDOM
+from graspq.evaluate.records import Evaluation
+from graspq.evaluate.report_data import Findings, RunData, Score, comparisons
+from graspq.evaluate.statistics import mean_over_seeds
+
+REFERENCE_COLORS = {RANDOM: 8, ORACLE: 9}
+PER_RUN = ("seed", "out")  # settings in which runs of one experiment may differ
+
+
+def percent(rate: float, digits: int = 1) -> str:
+    """Return a rate as a percentage."""
+    return f"{100 * rate:.{digits}f}\N{NO-BREAK SPACE}%"
+
+
+def interval_text(low: float, high: float) -> str:
+    """Return an interval of rates in percent."""
+    return f"{100 * low:.1f} – {100 * high:.1f}"
+
+
+def set_name(summary: dict[str, Any]) -> str:
+    """Return the name of an evaluation's object set."""
+    return str(summary.get("object_set", {}).get("name", "unknown"))
+
+
+def panel_of(
+    key: tuple[str, str, str], scores: Sequence[Score], runs: Sequence[RunData], colors: dict[str, int]
+) -> dict[str, Any]:
+    """Return a panel of success: bars, differences, means over training seeds."""
+    task, split, digest = key
+    counts = sorted({score.episodes for score in scores})
+    episodes = f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,} to {counts[-1]:,}"
+    name = set_name(scores[0].evaluations[0].summary)
+    return {
+        "title": f"{task.capitalize()} task, {split} split",
+        "subtitle": f"{episodes} episodes a policy, object set {name} {digest[:8]}",
+        "bars": [_bar(score, colors) for score in scores],
+        "comparisons": [
+            {
+                "first": first,
+                "second": second,
+                "difference": f"{100 * result.difference:+.1f}",
+                "interval": f"{100 * result.low:+.1f} … {100 * result.high:+.1f}",
+                "first_only": result.first_only,
+                "second_only": result.second_only,
+                "scenes": result.scenes,
+                "p": f"{result.p_value:.3f}" if result.p_value >= 0.001 else "< 0.001",
+            }
+            for first, second, result in comparisons(scores)
+        ],
+        "seeds": _seed_means(scores, runs),
+    }
+
+
+def _bar(score: Score, colors: dict[str, int]) -> dict[str, Any]:
+    low, high = score.interval
+    summary = score.evaluations[0].summary
+    checkpoint = summary.get("checkpoint_step")
+    return {
+        "name": score.name,
+        "note": f"step {checkpoint:,}" if checkpoint is not None else "",
+        "reference": score.is_reference,
+        "color": REFERENCE_COLORS.get(score.policy or "", colors.get(score.name, 0)),
+        "percent": round(100 * score.rate, 2),
+        "low": round(100 * low, 2),
+        "width": round(100 * (high - low), 2),
+        "text": percent(score.rate),
+        "interval": interval_text(low, high),
+        "episodes": score.episodes,
+    }
+
+
+def _seed_means(scores: Sequence[Score], runs: Sequence[RunData]) -> list[dict[str, str]]:
+    """Return the mean over runs that differ in their seed alone."""
+    groups: dict[str, list[Score]] = {}
+    settings = {run.name: run.settings for run in runs}
+    for score in scores:
+        if score.name in settings:
+            shared = {name: value for name, value in settings[score.name].items() if name not in PER_RUN}
+            groups.setdefault(json.dumps(shared, sort_keys=True, default=str), []).append(score)
+    rows = []
+    for group in groups.values():
+        if len(group) < 2:
+            continue
+        mean = mean_over_seeds([score.rate for score in group])
+        interval = interval_text(mean.low, mean.high) if mean.low is not None and mean.high is not None else "–"
+        name = str(settings[group[0].name].get("algo", group[0].name))
+        names = ", ".join(score.name for score in group)
+        rows.append({"name": name, "runs": names, "mean": percent(mean.mean), "interval": interval})
+    return rows
+
+
+def evaluation_row(score: Score, one: Evaluation) -> dict[str, Any]:
+    """Return a row of the table of evaluations."""
+    summary = one.summary
+    ends = summary.get("ends", {})
+    checkpoint = summary.get("checkpoint_step")
+    return {
+        "name": score.name,
+        "task": summary["task"],
+        "split": summary["split"],
+        "seed": summary["seed"],
+        "episodes": f"{summary['episodes']:,}",
+        "successes": f"{summary['successes']:,}",
+        "rate": percent(summary["success_rate"]),
+        "interval": interval_text(*summary["ci95"]),
+        "steps": f"{summary['mean_steps']:.2f}",
+        "height": percent(ends.get("height", 0) / summary["episodes"], 0),
+        "checkpoint": f"{checkpoint:,}" if checkpoint is not None else "–",
+        "objects": f"{set_name(summary)} {summary.get('object_set', {}).get('sha256', '')[:8]}",
+    }
+
+
+def settings_table(runs: Sequence[RunData]) -> dict[str, Any]:
+    """Return the settings of runs side by side, those that differ first."""
+    names = list(dict.fromkeys(name for run in runs for name in run.settings))
+    rows = []
+    for name in names:
+        cells = [_value(run.settings.get(name)) for run in runs]
+        rows.append({"name": name, "cells": cells, "differs": len(set(cells)) > 1})
+    return {"names": [run.name for run in runs], "rows": sorted(rows, key=lambda row: not row["differs"])}
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return "–"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def command_lines(findings: Findings) -> list[str]:
+    """Return the commands that made the runs and evaluations."""
+    commands = [train_command(run) for run in findings.runs]
+    commands += [one.summary["command"] for one in findings.evaluations if "command" in one.summary]
+    return list(dict.fromkeys(commands))
+
+
+def train_command(run: RunData) -> str:
+    """Return the command line that makes a run again; settings at their preset's values are left out."""
+    from graspq.train.settings import preset_settings
+
+    given = run.settings
+    try:
+        usual = preset_settings(given["preset"], algo=given["algo"], shards=tuple(given["shards"])).to_json()
+    except (KeyError, TypeError, UserError):
+        return str(run.config.get("command", "grasp-train"))
+    words = ["grasp-train", "--algo", given["algo"], "--shards", *given["shards"]]
+    for name, value in given.items():
+        if name in ("algo", "shards") or (name in usual and value == usual[name]):
+            continue
+        if isinstance(value, bool):
+            words.append(flag(name) if value else f"--no-{flag(name)[2:]}")
+        elif value is not None:
+            words += [flag(name), str(value)]
+    return shlex.join(words)
+
+
+def version_rows(findings: Findings) -> list[tuple[str, str]]:
+    """Return package → versions over all runs and evaluations, code revisions last."""
+    found: dict[str, dict[str, None]] = {}
+    sources = [*(run.config for run in findings.runs), *(one.summary for one in findings.evaluations)]
+    for source in sources:
+        for name, version in (source.get("versions") or {}).items():
+            found.setdefault(name, {})[str(version)] = None
+    for source in sources:
+        if source.get("code_revision"):
+            found.setdefault("code revision", {})[str(source["code_revision"])] = None
+    return [(name, ", ".join(values)) for name, values in found.items()]

@@ -1,0 +1,136 @@
+"""One object before it is a file: convex parts in the body frame, with mass, inertia and colour.
+
+The body frame has its origin at the centre of mass and its axes along the principal axes of inertia, so the inertia is
+diagonal and a simulator's base frame is the mesh frame.
+"""
+
+import colorsys
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+
+from graspq.objects.geometry import Array, MassProperties, principal_axes, union_mass_properties
+
+# 0.1 micrometre: what an OBJ file keeps of a coordinate.
+COORDINATE_DECIMALS = 7
+Color = tuple[float, float, float, float]
+# Hues (shares of the colour circle) that look evenly spaced, from pink over red, yellow, green and teal to blue.
+# Purple, 0.64 to 0.92, is left out: it is reserved for the target of the targeted task.
+_HUES = (0.92, 0.96, 1.0, 1.06, 1.13, 1.22, 1.35, 1.47, 1.54, 1.59, 1.64)
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectModel:
+    """A rigid body; see the module for its frame.
+
+    `parts`: convex, watertight, faces outward, metres; `mass` kg; `inertia` [3] principal moments, kg m²; `volume` m³;
+    `color` (r, g, b, a) in [0, 1].
+    """
+
+    object_id: str
+    split: str
+    families: tuple[str, ...]
+    color: Color
+    parts: tuple[trimesh.Trimesh, ...]
+    mass: float
+    inertia: tuple[float, float, float]
+    volume: float
+
+    @property
+    def points(self) -> Array:
+        """All vertices of all parts [V, 3]."""
+        return np.concatenate([part.vertices for part in self.parts])
+
+    @property
+    def extents(self) -> tuple[float, float, float]:
+        """Side lengths of the axis-parallel bounding box in the body frame, metres."""
+        x, y, z = (float(length) for length in np.ptp(self.points, axis=0))
+        return x, y, z
+
+    @property
+    def triangles(self) -> int:
+        """Number of triangles of all parts."""
+        return sum(len(part.faces) for part in self.parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """Convex parts in the body frame, not scaled yet, with their principal moments for density 1."""
+
+    parts: tuple[trimesh.Trimesh, ...]
+    volume: float
+    moments: Array
+
+    @property
+    def points(self) -> Array:
+        """All vertices of all parts [V, 3]."""
+        return np.concatenate([part.vertices for part in self.parts])
+
+    def model(
+        self,
+        *,
+        object_id: str,
+        split: str,
+        families: Sequence[str],
+        color: Color,
+        scale: float = 1.0,
+        density: float | None = None,
+        mass: float | None = None,
+    ) -> ObjectModel:
+        """Return the body at `scale` with either a density (kg/m³) or a mass (kg)."""
+        volume = self.volume * scale**3
+        if mass is None:
+            assert density is not None, "give a density or a mass"
+            mass = density * volume
+        moments = [significant(value * scale**5 * mass / volume) for value in self.moments]
+        parts = tuple(
+            trimesh.Trimesh(_on_grid(part.vertices * scale), part.faces, process=False, validate=False)
+            for part in self.parts
+        )
+        return ObjectModel(
+            object_id=object_id,
+            split=split,
+            families=tuple(families),
+            color=color,
+            parts=parts,
+            mass=significant(mass),
+            inertia=(moments[0], moments[1], moments[2]),
+            volume=significant(volume),
+        )
+
+
+def body_from_parts(parts: Sequence[trimesh.Trimesh]) -> Body:
+    """Move convex parts into the body frame of their union.
+
+    Raises:
+        UserError: too many parts lie inside each other; see `union_mass_properties`.
+    """
+    properties: MassProperties = union_mass_properties(parts)
+    moments, axes = principal_axes(properties.inertia_about_centre())
+    # On a grid, so that a last-bit difference between machines cannot reach the vertices.
+    centre = np.round(properties.centre, COORDINATE_DECIMALS)
+    moved = tuple(
+        trimesh.Trimesh((part.vertices - centre) @ axes, part.faces, process=False, validate=False) for part in parts
+    )
+    return Body(moved, properties.volume, moments)
+
+
+def _on_grid(vertices: Array) -> Array:
+    # Adding zero turns −0.0 into 0.0, which prints differently.
+    rounded: Array = np.round(vertices, COORDINATE_DECIMALS) + 0.0
+    return rounded
+
+
+def significant(value: float, digits: int = 7) -> float:
+    """Return `value` rounded to so many significant digits."""
+    return float(f"{value:.{digits - 1}e}")
+
+
+def draw_color(rng: np.random.Generator) -> Color:
+    """Draw a bright colour that is not purple: saturation 0.55 to 0.95, value 0.75 to 1."""
+    steps = len(_HUES) - 1
+    hue = float(np.interp(rng.uniform(0, steps), range(len(_HUES)), _HUES)) % 1.0
+    red, green, blue = colorsys.hsv_to_rgb(hue, rng.uniform(0.55, 0.95), rng.uniform(0.75, 1.0))
+    return round(red, 3), round(green, 3), round(blue, 3), 1.0

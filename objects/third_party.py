@@ -1,0 +1,246 @@
+"""Folders of third-party meshes as object sets: OBJ, STL, or URDF as in `pybullet_data/random_urdfs`.
+
+Convex pieces are kept, non-convex ones decomposed (V-HACD): what a simulator collides with is also what is drawn, and
+mass and inertia are those of the union of the pieces.
+"""
+
+import hashlib
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from graspq.common.errors import UserError
+from graspq.common.seeding import generator
+from graspq.objects.geometry import Array, convex_hull
+from graspq.objects.model import ObjectModel, body_from_parts, draw_color
+from graspq.objects.object_set import ObjectSet
+from graspq.objects.urdf import Source, read_urdf
+from graspq.objects.writing import write_object_set
+
+SMALLEST, LARGEST = 0.01, 0.30
+DENSITY = 450.0
+MOST_PARTS = 16
+_MESH_SUFFIXES = (".obj", ".stl")
+# Bullet advises against hulls of more than about 100 points; beyond this a hull is taken of its extreme points.
+_MOST_VERTICES = 64
+_TEST_EVERY = 10
+_CONVEX = 0.99
+_FLAT = 1e-6
+
+
+def import_meshes(
+    source: Path | str,
+    folder: Path | str,
+    *,
+    scale: float = 1.0,
+    density: float | None = None,
+    name: str | None = None,
+    skip: Callable[[str], None] | None = None,
+) -> ObjectSet:
+    """Make an object set of all meshes under `source` and return it.
+
+    Where there are URDFs, they are the objects (one rigid body each) and name their meshes; else every OBJ and STL is
+    one. Ids are the files' names. Split: where all ids are numbers, those that end in 0 are "test", as in the paper;
+    else every tenth of the sorted ids, from the first; the others are "train". A single object is "train".
+
+    Args:
+        source: folder to search, subfolders included.
+        folder: where the set goes; missing, empty, or the same set already.
+        scale: metres per unit of the files (a URDF's own mesh scale comes first), > 0.
+        density: kg/m³; None takes the mass a URDF states, and 450 kg/m³ where none does.
+        name: of the set; None takes the name of `source`.
+        skip: called with a line on each object that cannot be used, which is then left out; None refuses the folder.
+
+    Raises:
+        UserError: no such folder or no meshes in it; a mesh is unreadable, empty, flat, or its longest side is outside
+            1 cm to 30 cm; or the set cannot be written. Nothing is then left.
+    """
+    source = Path(source)
+    if not (scale > 0 and math.isfinite(scale)):
+        raise UserError(f"--scale: expected a number above 0, got {scale}")
+    if density is not None and not (density > 0 and math.isfinite(density)):
+        raise UserError(f"--density: expected a number of kg/m³ above 0, got {density}")
+    files = _object_files(source)
+    ids = list(files)
+    models = (
+        model
+        for one in ids
+        if (model := _usable(skip, source, one, files[one], split_of(one, ids), scale, density)) is not None
+    )
+    return write_object_set(
+        Path(folder),
+        models,
+        name=name if name is not None else _clean(source.resolve().name),
+        total=len(files),
+    )
+
+
+def _object_files(source: Path) -> dict[str, Path]:
+    """Return id → file of each object under `source`, sorted by id."""
+    if not source.is_dir():
+        raise UserError(f"{source}: no such folder; expected one with OBJ, STL or URDF files")
+    every = sorted(path for path in source.rglob("*") if path.is_file())
+    found = [path for path in every if path.suffix.lower() == ".urdf"]
+    found = found or [path for path in every if path.suffix.lower() in _MESH_SUFFIXES]
+    if not found:
+        raise UserError(f"{source}: no OBJ, STL or URDF files here or in subfolders")
+    names = [_clean(path.stem) for path in found]
+    if len(set(names)) < len(names):
+        names = [_clean("-".join(path.relative_to(source).with_suffix("").parts)) for path in found]
+    files = dict(sorted(zip(names, found, strict=True)))
+    if len(files) < len(found):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UserError(f"{source}: two files would both be the object {twice!r}; rename one of them")
+    return files
+
+
+def _clean(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._") or "object"
+
+
+def split_of(object_id: str, ids: list[str]) -> str:
+    """Return "test" or "train" for one of the sorted `ids`; the rule is `import_meshes`'s."""
+    if len(ids) == 1:
+        return "train"
+    if all(name.isdigit() for name in ids) and any(name.endswith("0") for name in ids):
+        return "test" if object_id.endswith("0") else "train"
+    return "test" if ids.index(object_id) % _TEST_EVERY == 0 else "train"
+
+
+def _usable(skip: Callable[[str], None] | None, *described: Any) -> ObjectModel | None:
+    """Return the model, or None where it cannot be used and `skip` takes the reason."""
+    try:
+        return _model(*described)
+    except UserError as error:
+        if skip is None:
+            raise UserError(f"{error.message}; or leave such objects out with --skip-unusable") from None
+        skip(f"left out {error.message}")
+        return None
+
+
+def _model(source: Path, object_id: str, path: Path, split: str, scale: float, density: float | None) -> ObjectModel:
+    described = read_urdf(path, source) if path.suffix.lower() == ".urdf" else Source(((path, np.eye(4)),), None, None)
+    pieces = [
+        mesh.apply_transform(transform).apply_scale(scale)
+        for file, transform in described.meshes
+        for mesh in _read_meshes(file)
+    ]
+    _check_scale(path, np.concatenate([piece.vertices for piece in pieces]), scale)
+    parts, families = convex_parts(pieces, path)
+    color = described.color
+    if color is None:
+        # A function of the id alone, so that an object keeps its colour when others are added.
+        key = int.from_bytes(hashlib.sha256(object_id.encode()).digest()[:6], "little")
+        color = draw_color(generator("objects/import", key))
+    mass = described.mass if density is None else None
+    chosen = density if density is not None else DENSITY
+    try:
+        body = body_from_parts(parts)
+    except UserError as error:
+        raise UserError(f"{path}: {error.message}") from None
+    return body.model(object_id=object_id, split=split, families=families, color=color, density=chosen, mass=mass)
+
+
+def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
+    """Return the meshes of a file: the groups of an OBJ one by one, since convex ones may share corners."""
+    try:
+        scene = trimesh.load_scene(
+            path, split_objects=True, split_groups=True, group_material=False, skip_materials=True
+        )
+        meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0]
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such mesh file") from None
+    # The readers of mesh formats raise whatever a damaged file leads them to.
+    except Exception as error:
+        raise UserError(f"{path}: not a readable mesh ({type(error).__name__}: {error}); repair or remove it") from None
+    if not meshes:
+        raise UserError(
+            f"{path}: an empty mesh or a damaged file, no triangle with finite corners; repair or remove it"
+        )
+    if not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
+        raise UserError(f"{path}: has corners that are not finite numbers; repair or remove it")
+    return meshes
+
+
+def _check_scale(path: Path, points: Array, scale: float) -> None:
+    longest = float(np.ptp(points, axis=0).max())
+    if SMALLEST <= longest <= LARGEST:
+        return
+    if longest == 0:
+        raise UserError(f"{path}: an empty mesh, all its vertices coincide; repair or remove it")
+    # Files in millimetres, centimetres or inches are the usual reason; else whatever makes the object 8 cm long.
+    common = [factor for factor in (0.001, 0.01, 0.0254, 1000.0, 100.0) if SMALLEST <= longest * factor <= LARGEST]
+    advised = scale * (common[0] if common else float(f"{0.08 / longest:.2g}"))
+    raise UserError(
+        f"{path}: longest side {longest:.4g} m, expected {SMALLEST:g} to {LARGEST:g} m; try --scale {advised:.4g}"
+    )
+
+
+def convex_parts(meshes: list[trimesh.Trimesh], path: Path) -> tuple[list[trimesh.Trimesh], tuple[str, ...]]:
+    """Return the convex parts of an object and its families: "convex" where pieces were kept, "decomposed" where not.
+
+    Loose pieces are taken one by one; where one is flat (a model of thin sheets), all are decomposed together.
+
+    Args:
+        meshes: of one body, metres.
+        path: for messages.
+
+    Raises:
+        UserError: all of them together are flat.
+    """
+    loose = [piece for mesh in meshes for piece in mesh.split(only_watertight=False)]
+    if not loose or any(_is_flat(piece) for piece in loose):
+        loose = [trimesh.util.concatenate(meshes)]
+    if _is_flat(loose[0]):
+        raise UserError(f"{path}: a flat mesh without volume; give it some thickness or remove it")
+    parts: list[trimesh.Trimesh] = []
+    families: list[str] = []
+    for piece in loose:
+        kept = _is_convex(piece)
+        parts += [coarse_hull(piece.vertices)] if kept else _decomposed(piece)
+        families.append("convex" if kept else "decomposed")
+    return parts, tuple(dict.fromkeys(families))
+
+
+def _is_flat(piece: trimesh.Trimesh) -> bool:
+    try:
+        hull = convex_hull(piece.vertices)
+    except ValueError:
+        return True
+    return bool(hull.volume < _FLAT * float(np.ptp(piece.vertices, axis=0).max()) ** 3)
+
+
+def _is_convex(piece: trimesh.Trimesh) -> bool:
+    """Return whether a piece fills its convex hull, to 1 %: published hulls have rounded corners."""
+    hull = convex_hull(piece.vertices)
+    return bool(piece.is_convex or (piece.is_watertight and abs(piece.volume) >= _CONVEX * hull.volume))
+
+
+def _decomposed(piece: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Return at most 16 convex parts that approximate a non-convex mesh (V-HACD)."""
+    # One thread, so that two runs agree.
+    found = piece.convex_decomposition(
+        maxConvexHulls=MOST_PARTS, maxNumVerticesPerCH=_MOST_VERTICES // 2, asyncACD=False
+    )
+    return [coarse_hull(part.vertices) for part in found if not _is_flat(part)]
+
+
+def coarse_hull(points: Array) -> trimesh.Trimesh:
+    """Return the convex hull of `points` [V, 3]; of more than 64 corners the extremes in 64 directions.
+
+    Raises:
+        ValueError: the points span no volume.
+    """
+    hull = convex_hull(np.unique(np.asarray(points, dtype=np.float64), axis=0))
+    if len(hull.vertices) <= _MOST_VERTICES:
+        return hull
+    steps = np.arange(_MOST_VERTICES) + 0.5
+    height, angle = 1 - 2 * steps / _MOST_VERTICES, steps * math.pi * (3 - math.sqrt(5))
+    flat = np.sqrt(1 - height**2)
+    directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
+    return convex_hull(hull.vertices[np.unique((hull.vertices @ directions.T).argmax(axis=0))])

@@ -1,0 +1,120 @@
+"""The Panda under Cartesian position control, its gripper vertical.
+
+Set-points run along straight lines with eased speed, one a simulation step, through the closed-form kinematics; motors
+do the rest.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from graspq.sim import kinematics, robot_model
+from graspq.sim.bullet import bullet
+from graspq.sim.task import TaskSettings
+from graspq.sim.world import World
+
+_PARKED = (0.45, 0.0, 0.55, 0.0)  # over the bin and out of the way of falling objects
+_ARM_FORCE = 150.0  # newton metres, more than the real arm's so that set-points are followed
+_ARM_GAIN = 0.35
+_FINGER_SPEED = 0.3  # metres a second
+_TCP_LINK = 11
+
+
+class Arm:
+    """Arm and parallel-jaw gripper; poses are (x, y, z, phi): metres in the world, radians about z, unwrapped."""
+
+    def __init__(self, world: World, task: TaskSettings) -> None:
+        self.task = task
+        self.client = world.client
+        self.world = world
+        # Without URDF_ENABLE_SLEEPING the arm never sleeps; it is always under control.
+        self.body = world.load_urdf(robot_model.panda_urdf(), fixed=True)
+        self.number = self.body.number
+        self.fingers = robot_model.FINGER_LINKS
+        # No shape of the arm touches another one; only hand and fingers have any.
+        for finger in self.fingers:
+            self.body.change_dynamics(
+                finger,
+                lateralFriction=task.finger_friction,
+                spinningFriction=task.rolling_friction,
+                rollingFriction=0.0,
+                restitution=0.0,
+            )
+        self.commanded = np.zeros(4)
+
+    def home(self) -> np.ndarray:
+        """Return the pose at which an episode starts."""
+        return np.array([self.task.bin_center_x, 0.0, self.task.home_height, 0.0])
+
+    def place(self, pose: Sequence[float] | np.ndarray) -> None:
+        """Put the arm at a pose at once, at rest, the gripper open."""
+        self.commanded = np.array(pose, dtype=float)
+        self._joints = kinematics.joint_angles(*self.commanded)
+        for joint, angle in zip(robot_model.ARM_JOINTS, self._joints, strict=True):
+            bullet.resetJointState(self.number, joint, angle, 0.0, physicsClientId=self.client)
+        for finger in self.fingers:
+            bullet.resetJointState(self.number, finger, robot_model.FINGER_OPENING, 0.0, physicsClientId=self.client)
+        self._hold(self._joints, (0.0,) * 7)
+        self.grip(open_gripper=True)
+
+    def park(self) -> None:
+        """Put the arm where no falling object can meet it."""
+        self.place(_PARKED)
+
+    def grip(self, *, open_gripper: bool) -> None:
+        """Command the fingers; they move while simulation steps pass."""
+        goal = robot_model.FINGER_OPENING if open_gripper else 0.0
+        for finger in self.fingers:
+            bullet.setJointMotorControl2(
+                self.number,
+                finger,
+                bullet.POSITION_CONTROL,
+                targetPosition=goal,
+                positionGain=0.3,
+                velocityGain=1.0,
+                force=self.task.finger_force,
+                maxVelocity=_FINGER_SPEED,
+                physicsClientId=self.client,
+            )
+
+    def move(self, pose: Sequence[float] | np.ndarray, steps: int, hold: int = 0) -> None:
+        """Move in a straight line to a pose in `steps` simulation steps, then hold it for `hold` more."""
+        start, goal = self.commanded, np.array(pose, dtype=float)
+        for index in range(1, steps + 1):
+            # Cosine easing: a jump in speed would jerk objects out of the gripper.
+            point = start + (goal - start) * (0.5 - 0.5 * math.cos(math.pi * index / steps))
+            joints = kinematics.joint_angles(*point.tolist())
+            speeds = [(now - before) / self.world.time_step for now, before in zip(joints, self._joints, strict=True)]
+            self._hold(joints, speeds)
+            self._joints = joints
+            self.world.step()
+        if hold > 0:
+            self._hold(self._joints, (0.0,) * 7)
+            self.world.step(hold)
+        self.commanded = goal
+
+    def _hold(self, joints: Sequence[float], speeds: Sequence[float]) -> None:
+        bullet.setJointMotorControlArray(
+            self.number,
+            robot_model.ARM_JOINTS,
+            bullet.POSITION_CONTROL,
+            targetPositions=joints,
+            targetVelocities=speeds,
+            positionGains=(_ARM_GAIN,) * 7,
+            velocityGains=(1.0,) * 7,
+            forces=(_ARM_FORCE,) * 7,
+            physicsClientId=self.client,
+        )
+
+    def pose(self) -> np.ndarray:
+        """Return the measured pose of the tool centre point, float64 [4]."""
+        link = bullet.getLinkState(self.number, _TCP_LINK, computeForwardKinematics=1, physicsClientId=self.client)
+        base = bullet.getJointState(self.number, 0, physicsClientId=self.client)[0]
+        wrist = bullet.getJointState(self.number, 6, physicsClientId=self.client)[0]
+        return np.array([*link[4], kinematics.wrist_turn(base, wrist)])
+
+    def finger_gap(self) -> float:
+        """Return the distance between the pads, metres."""
+        client = self.client
+        return float(sum(bullet.getJointState(self.number, f, physicsClientId=client)[0] for f in self.fingers))

@@ -1,0 +1,84 @@
+"""The bin on its table and the objects in it: building, dropping, settling, sleeping.
+
+Objects are dropped together from random poses and simulated until they rest; then they sleep until something touches
+them, which costs a third of the time of simulating them awake.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from graspq.objects.object_set import ObjectSet
+from graspq.sim.bullet import bullet
+from graspq.sim.task import TaskSettings
+from graspq.sim.world import Body, World
+
+_WALL_THICKNESS = 0.008
+_TABLE_COLOR = (0.62, 0.60, 0.57, 1.0)
+_FLOOR_COLOR = (0.80, 0.79, 0.76, 1.0)
+_WALL_COLOR = (0.42, 0.47, 0.53, 1.0)
+_DROP_SPACING = 0.055  # metres of height between one falling object and the next
+_REST_SPEED = 0.012  # metres a second
+_CHECK_EVERY = 20  # simulation steps
+
+
+def build_bin(world: World, task: TaskSettings) -> None:
+    """Add the table, the floor of the bin (its top is z = 0) and its walls."""
+    x, inner, wall = task.bin_center_x, task.bin_half_width, _WALL_THICKNESS / 2
+    height = task.wall_height / 2
+    outer = inner + 2 * wall
+    world.add_box((0.38, 0.40, 0.01), (x - 0.04, 0, -0.022), _TABLE_COLOR, collides=False)
+    floor = world.add_box((outer, outer, 0.02), (x, 0, -0.02), _FLOOR_COLOR)
+    walls = [
+        world.add_box((wall, outer, height), (x + side * (inner + wall), 0, height), _WALL_COLOR) for side in (-1, 1)
+    ]
+    walls += [world.add_box((inner, wall, height), (x, side * (inner + wall), height), _WALL_COLOR) for side in (-1, 1)]
+    for body in (floor, *walls):
+        body.change_dynamics(lateralFriction=0.8, restitution=0.0)
+
+
+def load_objects(world: World, task: TaskSettings, objects: ObjectSet, object_ids: Sequence[str]) -> list[Body]:
+    """Load objects, far below the table until they are dropped."""
+    bodies = []
+    for index, object_id in enumerate(object_ids):
+        record = objects[object_id]
+        body = world.load_urdf(objects.folder / record.urdf, position=(index * 0.3, 0, -2.0))
+        body.change_dynamics(
+            lateralFriction=task.object_friction,
+            spinningFriction=task.rolling_friction,
+            rollingFriction=task.rolling_friction,
+            restitution=0.0,
+            linearDamping=0.04,
+            angularDamping=0.06,
+        )
+        bodies.append(body)
+    return bodies
+
+
+def drop(bodies: Sequence[Body], task: TaskSettings, rng: np.random.Generator) -> None:
+    """Put the objects in the air over the bin, at random places and orientations, in a random order of height."""
+    order = rng.permutation(len(bodies))
+    places = rng.uniform(-task.drop_half_width, task.drop_half_width, size=(len(bodies), 2))
+    quaternions = Rotation.random(len(bodies), rng=rng).as_quat()
+    for body, rank, (dx, dy), quaternion in zip(bodies, order, places, quaternions, strict=True):
+        wake(body)
+        body.set_pose((task.bin_center_x + dx, dy, 0.06 + _DROP_SPACING * rank), quaternion)
+
+
+def settle(world: World, bodies: Sequence[Body], task: TaskSettings) -> int:
+    """Simulate until all objects rest, at most `settle_steps`; put them to sleep; return the steps taken."""
+    taken = 0
+    while taken < task.settle_steps:
+        world.step(_CHECK_EVERY)
+        taken += _CHECK_EVERY
+        if taken >= 100 and max(body.speed() for body in bodies) < _REST_SPEED:
+            break
+    for body in bodies:
+        body.change_dynamics(activationState=bullet.ACTIVATION_STATE_SLEEP | bullet.ACTIVATION_STATE_ENABLE_SLEEPING)
+    return taken
+
+
+def wake(body: Body) -> None:
+    """Wake an object and keep it awake."""
+    body.change_dynamics(activationState=bullet.ACTIVATION_STATE_WAKE_UP | bullet.ACTIVATION_STATE_DISABLE_SLEEPING)

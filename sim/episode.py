@@ -1,0 +1,180 @@
+"""One grasping cell as a simulation: load objects, start episodes, act, observe.
+
+Everything that happens is a function of `load`'s objects and the generators given to the `reset`s since then: `load`
+empties the world, so what happened before leaves no trace.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from graspq.objects.object_set import ObjectSet
+from graspq.sim import cell
+from graspq.sim.arm import Arm
+from graspq.sim.camera import Camera
+from graspq.sim.task import TaskSettings, rewarded_object
+from graspq.sim.world import Body, World
+
+_DESCEND_SPEED = 0.0025  # metres a simulation step
+_CLOSE_STEPS = 40
+_LIFT_STEPS = 84
+_HOLD_STEPS = 4  # the last simulation steps of an action, for the arm to come to rest
+_FINISHED = "the episode has ended; call reset first"
+
+
+@dataclasses.dataclass(frozen=True)
+class Observation:
+    """What is known before an action; a learned policy sees the image and the step alone.
+
+    Attributes:
+        image: uint8 [H, W, 3] RGB.
+        step: 0 .. max_steps.
+        gripper_pose: float32 [4], measured x, y, z (metres) and phi (radians, unwrapped).
+    """
+
+    image: np.ndarray
+    step: int
+    gripper_pose: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What an action led to.
+
+    Attributes:
+        observation: after the action; after the last one, of the gripper closed and lifted, if rendered at all.
+        reward: 1.0 for a successful grasp at the last step, else 0.0.
+        terminated: whether the episode has ended.
+        info: at the end `end` ("height" or "T"), `success`, `lifted_object` (id or None), `final_pose` (float32 [4],
+            after the last action and before the scripted descent); empty before.
+    """
+
+    observation: Observation
+    reward: float
+    terminated: bool
+    info: dict[str, Any]
+
+
+class GraspSimulation:
+    """A cell with its own physics client; close it, or use it in a `with` statement."""
+
+    def __init__(self, task: TaskSettings, objects: ObjectSet, *, gui: bool = False) -> None:
+        self.task, self.objects = task, objects
+        self.camera = Camera()
+        self.world = World(time_step=task.time_step, solver_iterations=task.solver_iterations, gui=gui)
+        self.object_ids: tuple[str, ...] = ()
+        self.bodies: list[Body] = []
+        self.step_count, self.terminated = 0, True
+        self._observation: Observation | None = None
+
+    def load(self, object_ids: Sequence[str]) -> None:
+        """Empty the world and build the cell with these objects."""
+        self.world.reset()
+        cell.build_bin(self.world, self.task)
+        self.arm = Arm(self.world, self.task)
+        self.object_ids = tuple(object_ids)
+        self.bodies = cell.load_objects(self.world, self.task, self.objects, object_ids)
+        self.terminated = True
+
+    def reset(self, rng: np.random.Generator) -> Observation:
+        """Drop the objects anew, home the arm and return the first observation."""
+        self.arm.park()
+        cell.drop(self.bodies, self.task, rng)
+        cell.settle(self.world, self.bodies, self.task)
+        self.arm.place(self.arm.home())
+        self.step_count, self.terminated = 0, False
+        self._observation = None
+        return self.observation
+
+    @property
+    def observation(self) -> Observation:
+        """The current observation; rendered when first asked for."""
+        if self._observation is None:
+            image = self.camera.render(self.world, self.task.image_size)
+            self._observation = Observation(image, self.step_count, self.arm.pose().astype(np.float32))
+        return self._observation
+
+    def object_poses(self) -> np.ndarray:
+        """Return float32 [K, 7]: position (metres) and quaternion (xyzw) of each object."""
+        poses = [[*position, *orientation] for position, orientation in (body.pose() for body in self.bodies)]
+        return np.asarray(poses, dtype=np.float32).reshape(len(self.bodies), 7)
+
+    def step(self, action: Sequence[float] | np.ndarray, *, observe_end: bool = True) -> Outcome:
+        """Apply one action.
+
+        Args:
+            action: [4] = [dx, dy, dz, dphi] in units of the action limits, clipped to [-1, 1].
+            observe_end: render the frame after the lift (collection has no use for it).
+
+        Raises:
+            RuntimeError: the episode has ended.
+            ValueError: the action has another shape or is not finite.
+        """
+        if self.terminated:
+            raise RuntimeError(_FINISHED)
+        values = np.asarray(action, dtype=float)
+        if values.shape != (4,) or not np.isfinite(values).all():
+            raise ValueError(f"an action is four finite numbers, got {action!r}")
+        self.arm.move(self._commanded_after(values), self.task.steps_per_action - _HOLD_STEPS, hold=_HOLD_STEPS)
+        self.step_count += 1
+        previous, self._observation = self._observation, None
+        low = bool(self.arm.commanded[2] < self.task.trigger_height)
+        if not low and self.step_count < self.task.max_steps:
+            return Outcome(self.observation, 0.0, False, {})
+        self.terminated = True
+        final_pose = self.arm.pose().astype(np.float32)
+        lifted = self._close_and_lift(descend=low)
+        rewarded = rewarded_object(self.task, self.objects, lifted)
+        info = {
+            "end": "height" if low else "T",
+            "success": rewarded is not None,
+            "lifted_object": rewarded if rewarded is not None else next(iter(lifted), None),
+            "final_pose": final_pose,
+        }
+        last = self.observation if observe_end or previous is None else previous
+        return Outcome(last, float(rewarded is not None), True, info)
+
+    def _commanded_after(self, action: np.ndarray) -> np.ndarray:
+        task = self.task
+        pose = self.arm.commanded + np.clip(action, -1.0, 1.0) * np.asarray(task.action_limits)
+        low = (task.bin_center_x - task.workspace, -task.workspace, task.grasp_height, -task.phi_limit)
+        high = (task.bin_center_x + task.workspace, task.workspace, task.home_height, task.phi_limit)
+        clipped: np.ndarray = np.clip(pose, low, high)
+        return clipped
+
+    def _close_and_lift(self, *, descend: bool) -> list[str]:
+        """Close where the gripper is (below the trigger height after a descent to the grasp height), then lift.
+
+        Returns the ids of the lifted objects, highest first.
+        """
+        pose = self.arm.commanded.copy()
+        if descend:
+            pose[2] = self.task.grasp_height
+            steps = max(4, round((self.arm.commanded[2] - pose[2]) / _DESCEND_SPEED))
+            self.arm.move(pose, steps, hold=2)
+        self.arm.grip(open_gripper=False)
+        self.world.step(_CLOSE_STEPS)
+        pose[2] += self.task.lift_height
+        self.arm.move(pose, _LIFT_STEPS, hold=4)
+        heights = [body.pose()[0][2] for body in self.bodies]
+        ranked = sorted(range(len(heights)), key=lambda index: -heights[index])
+        return [self.object_ids[index] for index in ranked if heights[index] > self.task.success_height]
+
+    def render(self, size: int) -> np.ndarray:
+        """Return the camera's view at another resolution, uint8 [size, size, 3]."""
+        return self.camera.render(self.world, size)
+
+    def close(self) -> None:
+        """Free the physics client."""
+        self.world.close()
+
+    def __enter__(self) -> "GraspSimulation":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,123 @@
+"""A thin object layer over PyBullet: a world owns its client, and bodies know their world.
+
+Several worlds live side by side in one process; no call can reach another world's client by mistake.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from graspq.sim.bullet import bullet
+
+Vector = Sequence[float] | np.ndarray
+
+
+class World:
+    """One physics client, without graphics unless asked for (`gui=True` opens PyBullet's window)."""
+
+    def __init__(self, *, time_step: float, solver_iterations: int, gui: bool = False) -> None:
+        """Connect.
+
+        Args:
+            time_step: seconds a simulation step.
+            solver_iterations: constraint solver's iterations a step.
+            gui: open a window (needs a display).
+
+        Raises:
+            RuntimeError: PyBullet was built without NumPy, or the window cannot be opened.
+        """
+        if not bullet.isNumpyEnabled():
+            raise RuntimeError("this PyBullet was built without NumPy: images would come back as tuples; reinstall it")
+        self.client = bullet.connect(bullet.GUI if gui else bullet.DIRECT)
+        if self.client < 0:
+            raise RuntimeError("PyBullet could not open its window; is there a display?")
+        self.gui = gui
+        self.time_step = time_step
+        self.solver_iterations = solver_iterations
+        self.reset()
+
+    def reset(self) -> None:
+        """Empty the world. Everything that follows is a function of the calls that follow."""
+        bullet.resetSimulation(physicsClientId=self.client)
+        bullet.setGravity(0, 0, -9.81, physicsClientId=self.client)
+        # Overlapping pairs in a fixed order: without it the solver may meet contacts in another order each run.
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=self.time_step,
+            numSolverIterations=self.solver_iterations,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=1,
+            physicsClientId=self.client,
+        )
+
+    def step(self, count: int = 1) -> None:
+        """Advance by `count` simulation steps."""
+        for _ in range(count):
+            bullet.stepSimulation(physicsClientId=self.client)
+
+    def load_urdf(self, path: Path, *, fixed: bool = False, flags: int = 0, position: Vector = (0, 0, 0)) -> "Body":
+        """Load a URDF with the inertia its file states."""
+        flags |= bullet.URDF_USE_INERTIA_FROM_FILE | bullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
+        number = bullet.loadURDF(
+            str(path), basePosition=position, useFixedBase=fixed, flags=flags, physicsClientId=self.client
+        )
+        return Body(self, number)
+
+    def add_box(self, half_extents: Vector, position: Vector, color: Vector, *, collides: bool = True) -> "Body":
+        """Add an immovable box (half extents and position in metres, colour RGBA in 0..1)."""
+        shape = -1
+        if collides:
+            shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half_extents, physicsClientId=self.client)
+        visual = bullet.createVisualShape(
+            bullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=color, physicsClientId=self.client
+        )
+        number = bullet.createMultiBody(0, shape, visual, position, physicsClientId=self.client)
+        return Body(self, number)
+
+    def close(self) -> None:
+        """Disconnect; closing twice does nothing."""
+        if self.client >= 0:
+            bullet.disconnect(physicsClientId=self.client)
+            self.client = -1
+
+    def __enter__(self) -> "World":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Body:
+    """One rigid or articulated body of a world."""
+
+    def __init__(self, world: World, number: int) -> None:
+        self.world, self.number = world, number
+
+    def pose(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return T_world_body as position (3, metres) and quaternion (4, xyzw)."""
+        position, orientation = bullet.getBasePositionAndOrientation(self.number, physicsClientId=self.world.client)
+        return position, orientation
+
+    def set_pose(self, position: Vector, orientation: Vector) -> None:
+        """Put the body somewhere, at rest."""
+        client = self.world.client
+        bullet.resetBasePositionAndOrientation(self.number, position, orientation, physicsClientId=client)
+        bullet.resetBaseVelocity(self.number, (0, 0, 0), (0, 0, 0), physicsClientId=client)
+
+    def speed(self) -> float:
+        """Return the greatest component of velocity, metres a second; turns count at a radius of 0.03 m."""
+        linear, angular = bullet.getBaseVelocity(self.number, physicsClientId=self.world.client)
+        return float(max(max(map(abs, linear)), 0.03 * max(map(abs, angular))))
+
+    def change_dynamics(self, link: int = -1, **values: Any) -> None:
+        """Set dynamics properties of a link (-1 is the base); names as in PyBullet."""
+        bullet.changeDynamics(self.number, link, physicsClientId=self.world.client, **values)
+
+    def bounds(self, link: int = -1) -> tuple[np.ndarray, np.ndarray]:
+        """Return the axis-aligned bounds of a link in the world, metres, grown by Bullet's contact margin."""
+        low, high = bullet.getAABB(self.number, link, physicsClientId=self.world.client)
+        return np.asarray(low), np.asarray(high)

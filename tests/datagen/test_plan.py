@@ -1,0 +1,42 @@
+from graspq.datagen.plan import human_bytes, human_time, missing_shards, plan_shards
+from graspq.datagen.settings import CollectionSettings, DatagenSettings
+from graspq.datasets.manifest import Manifest
+
+SETTINGS = CollectionSettings(block_size=20, blocks_per_shard=5)
+
+
+def empty_manifest():
+    return Manifest(
+        task={"name": "regular"}, settings=SETTINGS.described(), versions={}, object_set={}, image_shape=(64, 64, 3),
+        action_limits=(0.06, 0.06, 0.06, 0.4), discount=1.0, phi_range=(-1.75, 1.75),
+    )  # fmt: skip
+
+
+def test_a_larger_dataset_begins_with_the_same_shards():
+    small, large = plan_shards(SETTINGS, 200), plan_shards(SETTINGS, 1000)
+    assert large[:2] == small
+    assert sum(shard.episodes for shard in large) == 1000
+    assert [job.block for shard in large for job in shard.jobs] == list(range(50))
+
+
+def test_a_size_that_twenty_does_not_divide_ends_in_a_short_block():
+    plan = plan_shards(SETTINGS, 130)
+    assert [job.episodes for job in plan[-1].jobs] == [20, 10]
+    assert sum(shard.episodes for shard in plan) == 130
+
+
+def test_all_shards_of_an_empty_dataset_are_missing():
+    assert missing_shards(plan_shards(SETTINGS, 130), empty_manifest()) == plan_shards(SETTINGS, 130)
+
+
+def test_folders_are_named_after_task_and_size():
+    assert str(DatagenSettings(size=10_000).folder()) == "data/regular-10k"
+    assert str(DatagenSettings(size=1_000_000, task="targeted").folder()) == "data/targeted-1M"
+    assert str(DatagenSettings(size=2500).folder()) == "data/regular-2500"
+
+
+def test_bytes_and_times_are_written_as_people_read_them():
+    assert human_bytes(35_200_000) == "35.2 MB"
+    assert human_bytes(999) == "999 B"
+    assert human_time(72_000) == "20.0 h"
+    assert human_time(600) == "10 min"

@@ -1,0 +1,54 @@
+import contextlib
+import dataclasses
+
+import numpy as np
+import pytest
+
+from graspq.datasets.card import EPISODES_FEATURES, STEPS_FEATURES, card_text
+from graspq.datasets.manifest import Manifest
+from graspq.datasets.schema import episodes_schema, steps_schema
+
+
+@pytest.fixture
+def header(dataset):
+    """The YAML header as lines; what it says is compared with the schemas."""
+    return (dataset / "README.md").read_text().split("---\n")[1].splitlines()
+
+
+def test_five_lines_of_the_card_read_the_images_into_numpy(dataset, drawn):
+    code = (dataset / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    assert len(code.splitlines()) == 5
+    names = {}
+    with contextlib.chdir(dataset):
+        exec(code, names)
+    expected = np.concatenate([episode.images for episode in drawn.episodes(0, 5)])
+    assert np.array_equal(names["images"], expected)
+
+
+def test_the_header_names_both_tables_and_their_files(header):
+    configs = header[header.index("configs:") + 1 : header.index("dataset_info:")]
+    names = [line.removeprefix("- config_name: ") for line in configs if line.startswith("- ")]
+    paths = [line.strip().removeprefix("path: ") for line in configs if "path: " in line]
+    assert dict(zip(names, paths, strict=True)) == {"steps": "shards/*.parquet", "episodes": "episodes/*.parquet"}
+    for line in ("license: mit", "- robotics", "- n<1K", "- reinforcement-learning"):
+        assert line in header
+
+
+def test_the_header_declares_the_columns_of_the_schemas(dataset, header):
+    manifest = Manifest.load(dataset)
+    declared = [line.removeprefix("  - name: ") for line in header if line.startswith("  - name: ")]
+    assert declared == steps_schema(manifest).names + episodes_schema(manifest).names
+    start = header.index("  - name: action")
+    assert header[start + 1 : start + 3] == ["    list: float32", "    length: 4"]
+
+
+@pytest.mark.parametrize(("rows", "category"), [(999, "n<1K"), (1000, "1K<n<10K"), (5_600_000, "1M<n<10M")])
+def test_the_size_category_follows_the_rows(dataset, rows, category):
+    manifest = Manifest.load(dataset)
+    entry = dataclasses.replace(manifest.shards[0], rows=rows)
+    assert f"\n- {category}\n" in card_text(dataclasses.replace(manifest, shards=(entry,)))
+
+
+def test_every_column_is_described(dataset):
+    text = card_text(Manifest.load(dataset)).split("---\n")[2]
+    assert [name for name in (*STEPS_FEATURES, *EPISODES_FEATURES) if f"`{name}`" not in text] == []

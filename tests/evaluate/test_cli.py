@@ -1,0 +1,209 @@
+"""`grasp-eval` from the command line: files, skipping, tables, exit status and one line for each mistake."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from graspq.common.files import sha256_of
+from graspq.evaluate.films import read_films
+from graspq.evaluate.records import Evaluation
+from graspq.evaluate.statistics import wilson_interval
+
+SMALL = ("--episodes", "2", "--environments", "2", "--workers", "1")
+
+
+@pytest.fixture(scope="module")
+def workplace(run_folder: Path, dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A run and the random policy, evaluated together by one command."""
+    from graspq.evaluate.cli import evaluate
+    from graspq.evaluate.settings import EvalSettings
+
+    out = tmp_path_factory.mktemp("scores")
+    settings = EvalSettings(
+        runs=(str(run_folder),), policy=("random",), episodes=2, environments=2, workers=1, films=2, out=out
+    )
+    return SimpleNamespace(out=out, settings=settings, status=evaluate(settings))
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    return {str(path.relative_to(folder)): sha256_of(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_an_evaluation_holds_what_the_design_promises(
+    workplace: SimpleNamespace, run_folder: Path, dataset: Path
+) -> None:
+    assert workplace.status == 0
+    evaluation = Evaluation.load(workplace.out / "mc-regular-test-seed0-2")
+    summary, rows = evaluation.summary, evaluation.rows()
+    assert [row.episode for row in rows] == [0, 1]
+    assert (summary["task"], summary["split"], summary["episodes"], summary["seed"]) == ("regular", "test", 2, 0)
+    assert summary["successes"] == sum(row.success for row in rows)
+    assert summary["success_rate"] == summary["successes"] / 2
+    assert tuple(summary["ci95"]) == pytest.approx(wilson_interval(summary["successes"], 2))
+    assert (summary["algo"], summary["checkpoint_step"], summary["run"]) == ("mc", 4, run_folder.as_posix())
+    assert summary["object_set"]["sha256"] == sha256_of(dataset / "objects" / "object_set.json")
+    assert summary["cem"] == {"iterations": 3, "samples": 64, "elites": 6}
+    assert summary["command"].startswith("grasp-eval ") and "--episodes 2" in summary["command"]
+    assert summary["versions"]["pybullet"]
+    assert {film.row.episode for film in read_films(evaluation)} <= {0, 1}
+
+
+def test_several_jobs_give_one_table_in_two_formats(workplace: SimpleNamespace) -> None:
+    rows = [json.loads(line) for line in (workplace.out / "results.jsonl").read_text().splitlines()]
+    assert [(row["label"], row["status"]) for row in rows] == [("mc", "finished"), ("random", "finished")]
+    with (workplace.out / "results.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [row["label"] for row in table] == ["mc", "random"]
+    assert [float(row["success_rate"]) for row in table] == [row["success_rate"] for row in rows]
+    assert rows[0]["object_set_sha256"] == rows[1]["object_set_sha256"]
+
+
+def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -> None:
+    ours, theirs = (Evaluation.load(workplace.out / f"{name}-regular-test-seed0-2").rows() for name in ("mc", "random"))
+    assert [row.object_ids for row in ours] == [row.object_ids for row in theirs]
+
+
+def test_finished_jobs_are_not_run_again_and_nothing_changes(
+    workplace: SimpleNamespace, run_folder: Path, command: Any
+) -> None:
+    before = files_of(workplace.out)
+    times = {path: path.stat().st_mtime_ns for path in workplace.out.rglob("eval.json")}
+    done = command("grasp-eval", run_folder, "--policy", "random", *SMALL, "--films", "2", "--out", workplace.out)
+    assert done.code == 0 and done.out.count("finished") == 2
+    assert files_of(workplace.out) == before
+    assert times == {path: path.stat().st_mtime_ns for path in workplace.out.rglob("eval.json")}
+
+
+def test_another_job_never_overwrites_an_evaluation_and_a_damaged_one_is_to_do(
+    workplace: SimpleNamespace, run_folder: Path, command: Any, tmp_path: Path
+) -> None:
+    out = tmp_path / "scores"
+    shutil.copytree(workplace.out, out)
+    plan = ("grasp-eval", run_folder, *SMALL, "--out", out, "--plan")
+    assert "finished" in command(*plan).out
+    other = command(*plan, "--checkpoint", "2")
+    assert other.code == 0 and "to do" in other.out
+    assert files_of(out) == files_of(workplace.out)
+    with (out / "mc-regular-test-seed0-2" / "episodes.jsonl").open("a") as file:
+        file.write("{}\n")
+    assert "to do" in command(*plan).out
+
+
+def test_a_failed_job_leaves_the_others_alone_and_shows_in_the_exit_status(
+    workplace: SimpleNamespace, run_folder: Path, command: Any, tmp_path: Path
+) -> None:
+    out = tmp_path / "scores"
+    shutil.copytree(workplace.out, out)
+    jobs = tmp_path / "jobs.toml"
+    runs = json.dumps([str(tmp_path / "absent"), str(run_folder)])
+    table = f'[[jobs]]\nruns = {runs}\npolicies = ["random"]\n'
+    jobs.write_text("episodes = 2\n" + table)
+    done = command("grasp-eval", "--jobs", jobs, "--environments", "2", "--out", out)
+    assert done.code == 1
+    assert "cannot run" in done.out and "absent" in done.err
+    rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
+    assert [(row["label"], row["status"]) for row in rows] == [
+        ("absent", "failed"),
+        ("mc", "finished"),
+        ("random", "finished"),
+    ]
+    assert "no training run" in rows[0]["error"]
+
+
+def test_a_users_policy_is_scored_and_filmed_by_the_same_command(
+    objects_folder: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = ("class Down:", "    def act(self, image, step):", "        return [0, 0, -1, 0]", "make = Down")
+    (tmp_path / "straight_down.py").write_text("\n".join(source) + "\n")
+    monkeypatch.chdir(tmp_path)
+    done = command(
+        "grasp-eval", "--policy", "straight_down:make", "--objects", objects_folder, "--split", "train",
+        "--episodes", "1", "--environments", "1", "--workers", "1",
+        "--video", "down.gif", "--video-size", "64", "--video-episodes", "1",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    (row,) = Evaluation.load(Path("runs/baselines/straight_down.make-regular-train-seed0-1")).rows()
+    assert (row.steps, row.end) == (4, "height")
+    assert all(name.startswith("train_") for name in row.object_ids)
+    frames = np.stack([frame[..., :3] for frame in imageio.mimread(tmp_path / "down.gif")])
+    assert len(frames) > 20 and frames.shape[1:] == (64, 64, 3)
+    assert np.abs(frames[0].astype(int) - frames[len(frames) // 2]).max() > 60
+    assert f"({int(row.success)} of 1 grasps" in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "nothing to evaluate"),
+        (("absent",), "absent/config.json: no training run"),
+        (("--policy", "greedy"), "'greedy' is unknown"),
+        (("--policy", "random", "--task", "stacking"), "unknown task 'stacking'; choose from regular, targeted"),
+        (("--policy", "random", "--episodes", "0"), "expected a whole number of at least 1"),
+        (("--policy", "random", "--episodes", "-3"), "expected a whole number of at least 1"),
+        (("--policy", "random", "--episodes", "many"), "expected a whole number of at least 1"),
+        (("--policy", "random", "--seed", "-1"), "expected a number of at least 0"),
+        (("--policy", "random"), "name one with --objects FOLDER or make it with: grasp-objects make"),
+        (("--policy", "random", "--objects", "absent"), "absent/object_set.json: no object set"),
+        (("--policy", "random", "--objects", "OBJECTS", "--split", "validation"), "split 'validation'"),
+        (("--policy", "random", "--objects", "OBJECTS", "--task", "targeted"), "'target'"),
+        (("RUN", "--checkpoint", "3"), "no checkpoint of step 3"),
+        (("RUN", "--task", "targeted", "--objects", "OBJECTS"), "'target'"),
+        (("RUN/checkpoints/step-00000004",), "a checkpoint, expected its run"),
+        (("RUN", "--cem-elites", "65"), "expected at most as many as samples (64), got 65"),
+        (("RUN", "--objects", "OBJECTS", "--episodes", "1", "--out", "FILE"), "cannot write the evaluation here"),
+        (("RUN", "--video", "film.avi"), "should end in .mp4 or .gif"),
+        (("RUN", "--policy", "random", "--video", "film.gif"), "one job makes one video"),
+        (("--policy", "no_such_module:make", "--objects", "OBJECTS"), "No module named 'no_such_module'"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_two(
+    arguments: tuple[str, ...],
+    said: str,
+    run_folder: Path,
+    objects_folder: Path,
+    command: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    places = {"RUN": str(run_folder), "OBJECTS": str(objects_folder), "FILE": "file/out"}
+    words = [next((w.replace(k, v) for k, v in places.items() if w.startswith(k)), w) for w in arguments]
+    done = command("grasp-eval", *words)
+    assert done.code == 2, done
+    assert len(done.lines) == 1 and said in done.lines[0], done.err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_damaged_mesh_is_refused_before_anything_runs(objects_folder: Path, command: Any, tmp_path: Path) -> None:
+    damaged = tmp_path / "objects"
+    shutil.copytree(objects_folder, damaged)
+    victim = next((damaged / "meshes").glob("test_*.obj"))
+    victim.write_bytes(victim.read_bytes()[:-20])
+    done = command("grasp-eval", "--policy", "random", "--objects", damaged, *SMALL, "--out", tmp_path / "out")
+    assert done.code == 2 and len(done.lines) == 1 and victim.name in done.lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_object_set_than_the_runs_must_be_asked_for(
+    run_folder: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from graspq.objects.procedural import make_procedural
+
+    monkeypatch.chdir(tmp_path)
+    moved = tmp_path / "run"
+    shutil.copytree(run_folder, moved)
+    config = json.loads((moved / "config.json").read_text())
+    config["dataset"]["object_set"] = {"name": "procedural", "sha256": "0" * 64}
+    (moved / "config.json").write_text(json.dumps(config))
+    make_procedural(tmp_path / "data/objects/regular", seed=1, train=5, test=5)
+    done = command("grasp-eval", moved, *SMALL, "--plan")
+    assert done.code == 2 and "not the object set of the run's data" in done.lines[0]
+    assert command("grasp-eval", moved, *SMALL, "--plan", "--objects", "data/objects/regular").code == 0

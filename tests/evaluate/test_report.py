@@ -1,0 +1,205 @@
+"""The report: one self-contained page from real runs and evaluations, also before anything is evaluated."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graspq.evaluate.films import Film, write_films
+from graspq.evaluate.records import EpisodeRow, Evaluation, write_rows, write_summary
+from graspq.evaluate.report import render, write_report
+from graspq.evaluate.report_data import calibration_of, comparisons, gather
+from graspq.evaluate.statistics import paired_difference, wilson_interval
+
+VOID = {"meta", "img", "br", "line", "rect", "circle", "path", "input", "link"}
+
+
+class Checker(HTMLParser):
+    """Collects a page's references, and checks that its tags are nested."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.references: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.labels: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.references += [str(values[name]) for name in ("src", "href") if name in values]
+        if tag == "img":
+            self.images.append(values)
+        if values.get("role") == "img":
+            self.labels.append(str(values.get("aria-label")))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def checked(page: str) -> Checker:
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    assert all(reference.startswith("data:image/png;base64,") for reference in checker.references)
+    assert "http://" not in page and "https://" not in page and "<script" not in page and "@import" not in page
+    return checker
+
+
+def make_evaluation(
+    folder: Path, label: str, successes: np.ndarray, *, policy: str = "cem", seed: int = 0, films: int = 0
+) -> Evaluation:
+    """Write an evaluation of these outcomes with the real writers."""
+    folder.mkdir(parents=True)
+    rows = [
+        EpisodeRow(index, seed, ("test_001",), bool(success), "test_001" if success else None, 4, "height",
+                   float(success), 0.8 if success else 0.3)
+        for index, success in enumerate(successes)
+    ]  # fmt: skip
+    write_rows(folder, rows)
+    frames = np.arange(3 * 64 * 64 * 3, dtype=np.uint32).astype(np.uint8).reshape(3, 64, 64, 3)
+    write_films(folder, [Film(row, frames) for row in rows[:films]])
+    count, total = int(sum(successes)), len(rows)
+    summary = {
+        "format_version": 1, "label": label, "task": "regular", "split": "test", "episodes": total,
+        "successes": count, "success_rate": count / total, "ci95": list(wilson_interval(count, total)),
+        "mean_steps": 4.0, "ends": {"height": total, "T": 0}, "policy": policy, "run": None, "checkpoint_step": None,
+        "seed": seed, "object_set": {"name": "procedural", "sha256": "ab" * 32}, "command": f"grasp-eval {label}",
+        "versions": {"numpy": "2"}, "code_revision": "abc", "job": {"policy": label, "task": {}},
+    }  # fmt: skip
+    return write_summary(folder, summary)
+
+
+@pytest.fixture
+def scored(tmp_path: Path, run_folder: Path) -> Path:
+    """Two runs with evaluations, and the baselines."""
+    import shutil
+
+    rng = np.random.default_rng(0)
+    hard = rng.random(200)
+    for name, rate in (("mc", 0.6), ("dql", 0.5)):
+        shutil.copytree(run_folder, tmp_path / "runs" / name)
+        config = json.loads((tmp_path / "runs" / name / "config.json").read_text())
+        config["settings"] |= {"algo": name, "out": name}
+        (tmp_path / "runs" / name / "config.json").write_text(json.dumps(config))
+        make_evaluation(tmp_path / f"runs/{name}/evaluations/regular-test-seed0-200", name, hard < rate, films=2)
+    for name, rate in (("random", 0.2), ("oracle", 0.95)):
+        make_evaluation(tmp_path / f"baselines/{name}", name, hard < rate, policy=name)
+    return tmp_path
+
+
+def test_a_page_with_everything_is_self_contained_and_says_what_was_measured(scored: Path) -> None:
+    write_report([scored / "runs"], scored / "out.html", baselines=scored / "baselines")
+    page = (scored / "out.html").read_text()
+    checker = checked(page)
+    rates = {}
+    for label in checker.labels:
+        match = re.match(r"(\w+): ([\d.]+)\N{NO-BREAK SPACE}%, 95 % interval ([\d.]+) – ([\d.]+), 200 episodes", label)
+        if match is not None:
+            rates[match[1]] = tuple(map(float, match.groups()[1:]))
+    hard = np.random.default_rng(0).random(200)
+    assert list(rates) == ["random", "dql", "mc", "oracle"]
+    for name, rate in (("random", 0.2), ("dql", 0.5), ("mc", 0.6), ("oracle", 0.95)):
+        count = int((hard < rate).sum())
+        expected = [count / 200, *wilson_interval(count, 200)]
+        assert rates[name] == pytest.approx([100 * value for value in expected], abs=0.051)
+    assert "mc succeeds in" in page and "of held-out grasps" in page
+    assert len(checker.images) == 2 * 2 * 3 and all(image["alt"] for image in checker.images)
+    for section in ("success", "learning", "calibration", "films", "evaluations", "settings", "commands"):
+        assert f'<section id="{section}">' in page
+    assert "prefers-color-scheme:dark" in page and 'name="viewport"' in page
+    assert "grasp-train --algo mc --shards" in page and "--batch-size 8" in page
+
+
+def test_a_run_that_was_never_evaluated_has_a_page_too(run_folder: Path) -> None:
+    page = render(gather([run_folder], None))
+    checked(page)
+    assert "Nothing has been evaluated yet" in page
+    assert "At the end, loss: mc, training" in page
+
+
+def test_evaluations_without_a_run_have_a_page_too(tmp_path: Path) -> None:
+    make_evaluation(tmp_path / "random", "random", np.array([True, False]), policy="random")
+    page = render(gather([tmp_path], None))
+    checked(page)
+    assert "Evaluation of the baselines" in page
+
+
+def test_names_from_users_are_escaped(tmp_path: Path) -> None:
+    make_evaluation(tmp_path / "e", "<script>alert(1)</script>", np.array([True, False]))
+    page = render(gather([tmp_path], None))
+    assert "<script>" not in page and "&lt;script&gt;" in page
+
+
+def test_baselines_of_other_scenes_are_left_out(tmp_path: Path, scored: Path) -> None:
+    folder = scored / "baselines" / "other"
+    evaluation = make_evaluation(folder, "random", np.array([True]), policy="random")
+    summary = {name: value for name, value in evaluation.summary.items() if name != "files"}
+    write_summary(folder, {**summary, "split": "train"})
+    findings = gather([scored / "runs"], scored / "baselines")
+    assert [key[:2] for key in findings.panels] == [("regular", "test")]
+
+
+def test_seeds_are_pooled_and_of_one_seed_the_longest_evaluation_counts(tmp_path: Path) -> None:
+    make_evaluation(tmp_path / "a", "mc", np.array([True] * 10), seed=0)
+    make_evaluation(tmp_path / "b", "mc", np.array([True] * 10 + [False] * 10), seed=0)
+    make_evaluation(tmp_path / "c", "mc", np.array([False] * 30), seed=1)
+    ((score,),) = gather([tmp_path], None).panels.values()
+    assert (score.successes, score.episodes) == (10, 50)
+
+
+def test_differences_are_those_of_scenes_that_both_policies_met(scored: Path) -> None:
+    findings = gather([scored / "runs"], scored / "baselines")
+    ((first, second, difference), *_) = comparisons(next(iter(findings.panels.values())))
+    hard = np.random.default_rng(0).random(200)
+    assert (first, second) == ("mc", "dql")
+    assert difference == paired_difference(hard < 0.6, hard < 0.5)
+
+
+def test_calibration_of_rollouts_is_binned_by_q() -> None:
+    row = EpisodeRow(0, 0, (), True, None, 1, "T", 1.0, 0.0)
+    rows = [replace(row, q=0.82, success=True), replace(row, q=0.88, success=False), replace(row, q=1.0, success=True)]
+    rows.append(replace(row, q=None, success=False))
+    bins = calibration_of(rows)
+    assert bins == [(pytest.approx(0.85), 0.5, 2), (1.0, 1.0, 1)]
+    assert calibration_of([]) == []
+
+
+def test_the_command_writes_the_page_and_refuses_what_holds_nothing(
+    run_folder: Path, command: Any, tmp_path: Path
+) -> None:
+    done = command("grasp-report", run_folder, "--out", tmp_path / "report.html", "--title", "Two <networks>")
+    assert done.code == 0
+    assert "Two &lt;networks&gt;" in (tmp_path / "report.html").read_text()
+    (tmp_path / "empty").mkdir()
+    for folder, said in (("absent", "no such folder"), ("empty", "neither a run of grasp-train")):
+        done = command("grasp-report", tmp_path / folder, "--out", tmp_path / "none.html")
+        assert done.code == 2 and len(done.lines) == 1 and said in done.lines[0]
+    (tmp_path / "file").write_text("")
+    done = command("grasp-report", run_folder, "--out", tmp_path / "file" / "report.html")
+    assert done.code == 2 and "cannot write the report here" in done.lines[0]
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_reports_statistics_and_plans_do_not_import_the_simulator(scored: Path) -> None:
+    script = (
+        "import sys; sys.modules['pybullet'] = None\n"
+        "import graspq.evaluate.cli, graspq.evaluate.statistics, graspq.evaluate.jobs, graspq.evaluate.batch\n"
+        "from pathlib import Path; from graspq.evaluate.report import write_report\n"
+        f"write_report([Path({str(scored / 'runs')!r})], Path({str(scored / 'out.html')!r}))\n"
+        "print([name for name in sys.modules if name.startswith('graspq.sim')])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=scored, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,132 @@
+import json
+import shutil
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspq.common.errors import UserError
+from graspq.common.files import sha256_of
+from graspq.objects.object_set import ObjectRecord, ObjectSet
+
+
+@pytest.fixture
+def copied(small_set: ObjectSet, tmp_path: Path) -> ObjectSet:
+    shutil.copytree(small_set.folder, tmp_path / "set")
+    return ObjectSet.load(tmp_path / "set")
+
+
+def test_a_set_is_loaded_as_it_was_made(small_set: ObjectSet) -> None:
+    loaded = ObjectSet.load(str(small_set.folder))
+    assert loaded == small_set
+    assert (loaded.name, loaded.seed, len(loaded)) == ("procedural", 7, 48)
+    assert loaded.digest() == sha256_of(small_set.folder / "object_set.json")
+    loaded.verify()
+
+
+def test_a_record_survives_json(small_set: ObjectSet) -> None:
+    record = small_set.objects[0]
+    assert ObjectRecord.from_json(json.loads(json.dumps(record.to_json()))) == record
+
+
+def test_the_urdf_states_mass_inertia_colour_and_a_mesh_beside_it(small_set: ObjectSet) -> None:
+    for record in small_set.objects:
+        path = small_set.folder / record.urdf
+        robot = ElementTree.parse(path).getroot()
+        meshes = {str(mesh.get("filename")) for mesh in robot.iter("mesh")}
+        assert meshes == {Path(record.mesh).name}
+        assert (path.parent / meshes.pop()).is_file()
+        inertia = robot.find("link/inertial/inertia")
+        mass, color = robot.find("link/inertial/mass"), robot.find("link/visual/material/color")
+        assert inertia is not None and mass is not None and color is not None
+        assert tuple(float(inertia.get(name, "")) for name in ("ixx", "iyy", "izz")) == record.inertia
+        assert float(mass.get("value", "")) == record.mass
+        assert tuple(float(word) for word in color.get("rgba", "").split()) == record.color
+
+
+def test_the_obj_has_one_group_for_each_convex_part(small_set: ObjectSet) -> None:
+    for record in small_set.objects:
+        lines = (small_set.folder / record.mesh).read_text().splitlines()
+        assert sum(line.startswith("o ") for line in lines) == record.parts
+
+
+def test_parts_of_reads_the_vertices_of_the_obj(small_set: ObjectSet) -> None:
+    record = small_set.objects[3]
+    lines = (small_set.folder / record.mesh).read_text().splitlines()
+    vertices = np.array([[float(word) for word in line.split()[1:]] for line in lines if line.startswith("v ")])
+    parts = small_set.parts_of(record.object_id)
+    np.testing.assert_array_equal(np.concatenate([part.vertices for part in parts]), vertices)
+
+
+def test_verify_names_the_first_damaged_or_missing_file(copied: ObjectSet) -> None:
+    damaged = copied.folder / copied["train_003"].mesh
+    content = bytearray(damaged.read_bytes())
+    content[100] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(UserError, match=r"train_003\.obj: damaged"):
+        copied.verify()
+    (copied.folder / copied["train_001"].urdf).unlink()
+    with pytest.raises(UserError, match=r"train_001\.urdf: cannot be read"):
+        copied.verify()
+
+
+def test_a_copy_is_identical_and_copying_again_keeps_it(small_set: ObjectSet, tmp_path: Path) -> None:
+    copy = small_set.copy_to(tmp_path / "dataset" / "objects")
+    assert copy.digest() == small_set.digest()
+    assert copy.objects == small_set.objects
+    before = {path: path.stat().st_mtime_ns for path in copy.folder.rglob("*")}
+    small_set.copy_to(tmp_path / "dataset" / "objects")
+    assert {path: path.stat().st_mtime_ns for path in copy.folder.rglob("*")} == before
+    assert [path.name for path in (tmp_path / "dataset").iterdir()] == ["objects"]
+
+
+def test_a_damaged_set_is_not_copied(copied: ObjectSet, tmp_path: Path) -> None:
+    (copied.folder / copied.objects[0].urdf).write_text("other")
+    with pytest.raises(UserError, match="damaged"):
+        copied.copy_to(tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
+
+
+def test_an_unknown_object_or_split_is_refused_with_what_there_is(small_set: ObjectSet) -> None:
+    with pytest.raises(UserError, match="no object 'cup'"):
+        small_set["cup"]
+    with pytest.raises(UserError, match="choose from train, test"):
+        small_set.ids("validation")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda values: values | {"format_version": 99}, "format_version 99, expected 1"),
+        (lambda values: {key: value for key, value in values.items() if key != "seed"}, "not a readable object set"),
+        (lambda values: values | {"objects": []}, "expected one or more objects"),
+        (lambda values: values | {"objects": values["objects"][:1] * 2}, "ids of their own"),
+        (lambda values: values | {"objects": [{"object_id": "x"}]}, "not a readable object set"),
+        (lambda values: [1, 2], "not a readable object set"),
+        (
+            lambda values: values | {"objects": [values["objects"][0] | {"sha256": {"../../secret": "0"}}]},
+            "inside the set's folder",
+        ),
+    ],
+)
+def test_a_manifest_that_is_none_gives_one_clear_error(copied: ObjectSet, change: object, message: str) -> None:
+    path = copied.folder / "object_set.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))  # type: ignore[operator]
+    with pytest.raises(UserError, match=message):
+        ObjectSet.load(copied.folder)
+
+
+def test_a_missing_or_corrupted_manifest_is_a_user_error(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no object set"):
+        ObjectSet.load(tmp_path / "nowhere")
+    (tmp_path / "object_set.json").write_bytes(b'{"format_version": 1, "obj\xff')
+    with pytest.raises(UserError, match="not a readable object set"):
+        ObjectSet.load(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["", "v 0 0\nf 1 2 3\n", "o a\nv 0 0 0\nf 1 2 9\n", "o a\nv x y z\n"])
+def test_an_unreadable_mesh_is_a_user_error(copied: ObjectSet, content: str) -> None:
+    (copied.folder / copied["train_000"].mesh).write_text(content)
+    with pytest.raises(UserError, match=r"train_000\.obj"):
+        copied.parts_of("train_000")

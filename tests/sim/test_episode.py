@@ -1,0 +1,103 @@
+import numpy as np
+import pytest
+from graspq.sim.episode import GraspSimulation
+from graspq.sim.policies import RandomPolicy
+from graspq.sim.task import TASKS, draw_objects
+
+TASK = TASKS["regular"]
+
+
+@pytest.fixture
+def simulation(regular_objects):
+    with GraspSimulation(TASK, regular_objects) as made:
+        made.load(draw_objects(TASK, regular_objects, "train", np.random.default_rng(0)))
+        yield made
+
+
+def test_the_reward_comes_at_the_last_step_alone_and_equals_success(simulation):
+    successes = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        simulation.reset(rng)
+        outcome = simulation.step(RandomPolicy().act(rng))
+        while not outcome.terminated:
+            assert outcome.reward == 0.0
+            assert outcome.info == {}
+            outcome = simulation.step(RandomPolicy().act(rng))
+        assert outcome.reward == float(outcome.info["success"])
+        assert (outcome.info["lifted_object"] is not None) == outcome.info["success"]
+        successes += outcome.info["success"]
+    assert 0 < successes < 12
+
+
+def test_going_below_the_trigger_height_ends_the_episode(simulation):
+    simulation.reset(np.random.default_rng(0))
+    outcomes = [simulation.step([0, 0, -1, 0]) for _ in range(4)]
+    assert [outcome.terminated for outcome in outcomes] == [False, False, False, True]
+    assert outcomes[-1].info["end"] == "height"
+    assert outcomes[-1].info["final_pose"][2] == pytest.approx(0.04, abs=0.004)
+
+
+def test_the_gripper_closes_where_it_is_after_fifteen_actions(simulation):
+    simulation.reset(np.random.default_rng(0))
+    outcomes = [simulation.step([0, 0, 0.5, 0]) for _ in range(15)]
+    assert [outcome.terminated for outcome in outcomes] == [False] * 14 + [True]
+    assert outcomes[-1].info["end"] == "T"
+    assert outcomes[-1].reward == 0.0
+    assert outcomes[-1].info["final_pose"][2] == pytest.approx(TASK.home_height, abs=0.002)
+    with pytest.raises(RuntimeError, match="call reset first"):
+        simulation.step([0, 0, 0, 0])
+
+
+def test_actions_are_displacements_in_units_of_the_limits(simulation):
+    start = simulation.reset(np.random.default_rng(0)).gripper_pose
+    moved = simulation.step([0.5, -1.0, -0.25, 1.0]).observation.gripper_pose
+    error = np.abs(moved - start - [0.03, -0.06, -0.015, 0.4])
+    assert (error < [0.003, 0.003, 0.003, 0.01]).all(), error
+
+
+def test_actions_beyond_one_are_clipped_and_the_workspace_bounds_the_gripper(simulation):
+    simulation.reset(np.random.default_rng(0))
+    for _ in range(5):
+        pose = simulation.step([9, 9, 9, 9]).observation.gripper_pose
+    np.testing.assert_allclose(pose, [0.55 + 0.13, 0.13, 0.28, 1.75], atol=0.004)
+
+
+@pytest.mark.parametrize("action", [[0, 0, 0], [0, 0, 0, float("nan")], np.zeros((1, 4))])
+def test_what_is_no_action_is_refused(simulation, action):
+    simulation.reset(np.random.default_rng(0))
+    with pytest.raises(ValueError, match="an action is four finite numbers"):
+        simulation.step(action)
+
+
+def test_the_same_generators_give_the_same_pixels_whatever_happened_before(regular_objects):
+    ids = regular_objects.ids("train")[:5]
+
+    def play(simulation):
+        rng = np.random.default_rng(5)
+        simulation.load(ids)
+        frames = [simulation.reset(rng).image]
+        for _ in range(3):
+            frames.append(simulation.step(RandomPolicy(1.0).act(rng)).observation.image)
+        return np.stack(frames), simulation.object_poses()
+
+    with GraspSimulation(TASK, regular_objects) as first, GraspSimulation(TASK, regular_objects) as second:
+        images, poses = play(first)
+        second.load(regular_objects.ids("train")[5:10])
+        for seed in range(3):
+            second.reset(np.random.default_rng(seed))
+            second.step([0.3, 0.2, -1, 0])
+        again, poses_again = play(second)
+    np.testing.assert_array_equal(images, again)
+    np.testing.assert_array_equal(poses, poses_again)
+    assert len({frame.tobytes() for frame in images}) == 4
+
+
+def test_the_objects_rest_in_the_bin_before_the_first_action(simulation):
+    for seed in range(5):
+        simulation.reset(np.random.default_rng(seed))
+        before = simulation.object_poses()
+        assert np.abs(before[:, :2] - [TASK.bin_center_x, 0.0]).max() < TASK.bin_half_width
+        assert (before[:, 2] > 0).all() and (before[:, 2] < 0.15).all()
+        simulation.step([0, 0, 0, 0])
+        assert np.abs(simulation.object_poses()[:, :3] - before[:, :3]).max() < 0.002

@@ -1,0 +1,25 @@
+import numpy as np
+import pytest
+import trimesh
+from graspq.sim import robot_model
+
+
+@pytest.mark.parametrize("normals", list(robot_model._SYMMETRY.values()))
+def test_a_symmetric_hull_equals_its_mirror_image(normals):
+    points = np.random.default_rng(0).normal(size=(200, 3)) * [0.05, 0.03, 0.08]
+    hull = robot_model.symmetric_hull(points, normals)
+    for normal in normals:
+        direction = np.asarray(normal, dtype=float)
+        mirrored = hull.vertices - 2 * (hull.vertices @ direction)[:, None] * direction
+        distances = np.linalg.norm(mirrored[:, None] - hull.vertices[None], axis=2).min(axis=1)
+        assert distances.max() < 1e-6
+
+
+def test_the_light_panda_has_few_faces_and_collides_with_hand_and_fingers_alone():
+    folder = robot_model.panda_urdf().parent
+    faces = [len(trimesh.load(path, force="mesh").faces) for path in folder.glob("*.obj")]
+    assert len(faces) == 10
+    assert max(faces) <= 100
+    text = robot_model.panda_urdf().read_text()
+    assert text.count("<collision") == 3
+    assert text.count("<box") == 2

@@ -1,0 +1,102 @@
+"""The rules of the house, read from the source: imports, packaging, names that others own."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+# What each folder may import (DESIGN, section 1).
+MAY_IMPORT = {
+    "common": set(),
+    "objects": {"common"},
+    "sim": {"objects", "common"},
+    "datasets": {"common"},
+    "datagen": {"sim", "objects", "datasets", "common"},
+    "train": {"datasets", "common"},
+    "evaluate": {"sim", "objects", "train", "datasets", "common"},
+}
+
+
+def sources(folder):
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("folder", MAY_IMPORT)
+def test_a_folder_imports_only_what_the_design_allows(folder):
+    assert sources(folder)
+    for path in sources(folder):
+        ours = {name.split(".")[1] for name in imported(path) if name.startswith("graspq.")}
+        assert ours <= MAY_IMPORT[folder] | {folder}, path
+
+
+@pytest.mark.parametrize("folder", set(MAY_IMPORT) - {"sim"})
+def test_pybullet_is_imported_inside_sim_alone(folder):
+    for path in sources(folder):
+        assert not any(name.split(".")[0].startswith("pybullet") for name in imported(path)), path
+
+
+def test_training_data_tools_and_reports_run_without_pybullet(tmp_path):
+    code = (
+        "import sys; sys.modules['pybullet'] = None; sys.modules['pybullet_data'] = None\n"
+        "import graspq, graspq.train.cli, graspq.train.loop, graspq.datasets.cli, graspq.evaluate.report_cli\n"
+        "import graspq.objects.cli, graspq.datagen.cli, graspq.evaluate.cli, graspq.evaluate.report\n"
+    )
+    subprocess.run([sys.executable, "-P", "-c", code], check=True, cwd=tmp_path, timeout=120)
+
+
+def test_the_wheel_lives_beside_hugging_faces_datasets_and_evaluate(tmp_path):
+    target = tmp_path / "site"
+    copy = tmp_path / "source"
+    names = [*MAY_IMPORT, "graspq", "pyproject.toml", "README.md", "LICENSE"]
+    copy.mkdir()
+    for name in names:
+        subprocess.run(["cp", "-r", str(ROOT / name), str(copy)], check=True)
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--target"]
+    subprocess.run([*install, str(target), str(copy)], check=True, timeout=300)
+    assert not (target / "datasets").exists()
+    code = (
+        "import datasets, evaluate, graspq, graspq.datasets.dataset, graspq.evaluate.statistics\n"
+        f"assert graspq.__file__.startswith({str(target)!r}), graspq.__file__\n"
+        "assert hasattr(datasets, 'load_dataset') and hasattr(evaluate, 'load')\n"
+        "assert graspq.datasets.__name__ == 'graspq.datasets'\n"
+    )
+    environment = {"PYTHONPATH": str(target), "PATH": "/usr/bin:/bin", "HF_HUB_OFFLINE": "1", "HOME": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env=environment, timeout=120)
+
+
+def test_every_package_is_listed_and_every_command_answers_help_and_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    mapped = project["tool"]["setuptools"]["package-dir"]
+    assert set(mapped) == set(project["tool"]["setuptools"]["packages"])
+    assert set(mapped.values()) == set(MAY_IMPORT) | {"graspq"}
+    for script in project["project"]["scripts"]:
+        for option, expected in (("--help", "Usage:"), ("--version", "graspq, version")):
+            command = [str(Path(sys.executable).with_name(script)), option]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+            assert done.returncode == 0, done.stderr
+            assert expected in done.stdout
+
+
+def test_tests_mirror_the_folders():
+    for folder in MAY_IMPORT:
+        modules = {path.stem for path in sources(folder)}
+        for test in (ROOT / "tests" / folder).glob("test_*.py"):
+            assert test.stem.removeprefix("test_") in modules | {"mirror"}, test
+
+
+def test_no_file_outgrows_the_house():
+    long = {path.name for folder in MAY_IMPORT for path in sources(folder) if len(path.read_text().splitlines()) > 300}
+    assert long == set(), f"over 300 lines: {sorted(long)}"

@@ -1,0 +1,229 @@
+"""Runs: exact resumption after any stop, refusal of what does not fit, and a halt on numbers that are not finite."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from graspq.common.errors import UserError
+from graspq.train import loop
+from graspq.train.checkpoint import load_policy_network
+from graspq.train.loop import DivergedError, train
+from graspq.train.run import Run
+from graspq.train.settings import TrainSettings
+
+Make = Callable[..., TrainSettings]
+
+
+def same_checkpoints(first: Path, second: Path) -> bool:
+    names = sorted(path.name for path in first.iterdir())
+    assert names == sorted(path.name for path in second.iterdir())
+    return all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
+
+
+@pytest.mark.parametrize("algo", ["mc", "dql"])
+def test_twenty_steps_equal_ten_steps_a_checkpoint_and_ten_steps_bit_by_bit(
+    settings: Make, tmp_path: Path, algo: str
+) -> None:
+    unbroken = train(settings(algo, out=tmp_path / "unbroken", lag_steps=7))
+    train(settings(algo, out=tmp_path / "broken", lag_steps=7), stop_at=10)
+    torch.manual_seed(99)
+    resumed = train(settings(algo, out=tmp_path / "broken", lag_steps=7))
+    assert [row["step"] for row in resumed.metrics()] == [row["step"] for row in unbroken.metrics()]
+    assert same_checkpoints(unbroken.checkpoint(), resumed.checkpoint())
+
+
+def test_a_run_stopped_between_checkpoints_ends_in_the_same_weights(settings: Make, tmp_path: Path) -> None:
+    unbroken = train(settings("dql", out=tmp_path / "unbroken"))
+    train(settings("dql", out=tmp_path / "broken"), stop_at=3)
+    resumed = train(settings("dql", out=tmp_path / "broken"))
+    assert same_checkpoints(unbroken.checkpoint(20), resumed.checkpoint(20))
+
+
+def test_another_seed_gives_other_weights(settings: Make, tmp_path: Path) -> None:
+    first = train(settings(out=tmp_path / "first", steps=3))
+    other = train(settings(out=tmp_path / "other", steps=3, seed=1))
+    assert not same_checkpoints(first.checkpoint(), other.checkpoint())
+
+
+def test_what_was_killed_is_taken_up_from_the_last_checkpoint_without_double_metrics(
+    settings: Make, tmp_path: Path
+) -> None:
+    unbroken = train(settings(out=tmp_path / "unbroken"))
+    run = train(settings(out=tmp_path / "broken"), stop_at=10)
+    # What a kill leaves: metrics beyond the checkpoint, a row cut short, and a half-written checkpoint.
+    with run.metrics_file.open("a") as file:
+        file.write('{"step": 15, "loss": 123.0}\n{"step": 20, "lo')
+    (run.checkpoints_folder / ".tmp-1-step-00000020").mkdir()
+    resumed = train(settings(out=tmp_path / "broken"))
+    assert [row.get("loss") for row in resumed.metrics()] == [row.get("loss") for row in unbroken.metrics()]
+    assert [path.name for path in run.checkpoints_folder.iterdir() if path.name.startswith(".")] == []
+    assert same_checkpoints(unbroken.checkpoint(), resumed.checkpoint())
+
+
+def test_a_finished_run_is_left_as_it_is(settings: Make) -> None:
+    run = train(settings(steps=4))
+    before = {path: path.stat().st_mtime_ns for path in run.checkpoint().iterdir()}
+    train(settings(steps=4))
+    assert {path: path.stat().st_mtime_ns for path in run.checkpoint().iterdir()} == before
+
+
+def test_metrics_have_losses_rates_and_validation(settings: Make) -> None:
+    run = train(settings())
+    rows = run.metrics()
+    training = [row for row in rows if "loss" in row]
+    assert [row["step"] for row in training] == [5, 10, 15, 20]
+    assert set(training[0]) == {"step", "loss", "samples_per_second", "learning_rate"}
+    validation = [row for row in rows if "validation" in row]
+    assert [row["step"] for row in validation] == [10, 20]
+    measures = validation[-1]["validation"]
+    assert measures["last_steps"] < measures["transitions"] <= run.config["dataset"]["held_back"]["rows"]
+    assert len(measures["calibration"]) == 10 and 0 <= measures["roc_auc_last_step"] <= 1
+    assert list((run.folder / "tensorboard").glob("events.*"))
+
+
+def test_the_configuration_names_settings_data_versions_and_precision(settings: Make) -> None:
+    config = json.loads((train(settings(steps=2)).folder / "config.json").read_text())
+    assert config["settings"]["algo"] == "mc" and config["discount"] == 1.0
+    assert len(config["dataset"]["manifest_sha256"]) == 64 and config["dataset"]["task"]["name"] == "two-states"
+    assert config["precision"] == {"name": "float32", "device": "cpu", "probe": {"asked": "float32"}}
+    assert "torch" in config["versions"] and config["code_revision"]
+    assert config["network"]["name"] == "default"
+    split = config["dataset"]["training"]["blocks"], config["dataset"]["held_back"]["blocks"]
+    assert sum(split) == 60 and split[1] >= 1
+
+
+def test_only_the_newest_checkpoints_are_kept(settings: Make) -> None:
+    run = train(settings(steps=10, checkpoint_every=2, keep_checkpoints=2))
+    assert [path.name for path in run.checkpoints()] == ["step-00000008", "step-00000010"]
+
+
+def test_a_run_of_another_configuration_is_not_touched(
+    settings: Make, two_states: SimpleNamespace, tmp_path: Path
+) -> None:
+    train(settings(steps=4))
+    with pytest.raises(UserError, match=r"holds a run with learning_rate = 0.002, not 0.1; choose another folder"):
+        train(settings(steps=4, learning_rate=0.1))
+    other = two_states.dataset(tmp_path / "other", 50)
+    with pytest.raises(UserError, match="another dataset"):
+        train(settings(steps=4, shards=(str(other),)))
+    train(settings(steps=4, log_every=1, threads=None))
+
+
+def test_data_that_has_moved_is_the_same_data(settings: Make, two_states: SimpleNamespace, tmp_path: Path) -> None:
+    moved = two_states.dataset(tmp_path / "moved", 60)
+    train(settings(steps=4), stop_at=2)
+    assert train(settings(steps=4, shards=(str(moved),))).checkpoint().name == "step-00000004"
+
+
+def test_a_folder_of_something_else_is_not_touched(settings: Make, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match="not empty and not a training run"):
+        train(settings())
+
+
+def test_two_trainings_do_not_share_a_folder(settings: Make) -> None:
+    run = train(settings(steps=2))
+    with run.locked(), pytest.raises(UserError, match="another process trains here"):
+        train(settings(steps=2))
+
+
+def test_a_discount_that_the_returns_were_not_made_with_is_refused_for_mc(settings: Make) -> None:
+    with pytest.raises(UserError, match="--discount"):
+        train(settings("mc", discount=0.5))
+
+
+def test_divergence_stops_with_estimator_step_quantity_and_the_last_good_checkpoint(settings: Make) -> None:
+    with pytest.raises(DivergedError) as error:
+        train(settings("mc", preset="paper", network="conv", steps=40, learning_rate=1e30, checkpoint_every=1))
+    message = str(error.value)
+    assert message.startswith("mc diverged at step ") and "is not finite" in message and "\n" not in message
+
+
+def test_the_step_of_a_loss_that_is_not_finite_is_named_and_the_checkpoint_before_it_kept(settings: Make) -> None:
+    chosen = settings(steps=30, checkpoint_every=3, log_every=100)
+    run = train(chosen, stop_at=3)
+
+    class Poisoned(loop._Session):
+        def _update(self, batch: loop.Batch) -> torch.Tensor:
+            loss = super()._update(batch)
+            return loss * torch.nan if self.state.step == 5 else loss
+
+    original = loop._Session
+    loop._Session = Poisoned  # type: ignore[misc]
+    try:
+        with pytest.raises(DivergedError, match=r"mc diverged at step 5: the loss is not finite; .*step-00000003 is"):
+            train(chosen)
+    finally:
+        loop._Session = original  # type: ignore[misc]
+    assert run.latest_checkpoint() == run.folder / "checkpoints/step-00000003"
+
+
+COMMAND = "from graspq.train.cli import main; main()"
+
+
+def command(settings: TrainSettings, *more: str) -> list[str]:
+    assert settings.out is not None
+    options = ["--algo", settings.algo, "--shards", *settings.shards, "--out", str(settings.out), "--steps", "5000"]
+    options += ["--batch-size", "8", "--precision", "float32", "--threads", "1", "--checkpoint-every", "10"]
+    return [sys.executable, "-c", COMMAND, *options, *more]
+
+
+def wait_for_checkpoint(folder: Path, process: "subprocess.Popen[str]") -> None:
+    for _ in range(600):
+        if (folder / "checkpoints").is_dir() and list((folder / "checkpoints").glob("step-*")):
+            return
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    raise AssertionError("no checkpoint within a minute")
+
+
+def started(settings: TrainSettings) -> "subprocess.Popen[str]":
+    assert settings.out is not None
+    process = subprocess.Popen(
+        command(settings),
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    return process
+
+
+def test_a_run_that_is_killed_or_interrupted_keeps_a_checkpoint_that_loads(settings: Make, tmp_path: Path) -> None:
+    killed, interrupted = settings(out=tmp_path / "killed"), settings(out=tmp_path / "interrupted")
+    processes = [started(killed), started(interrupted)]
+    try:
+        for process, chosen, number in zip(
+            processes, (killed, interrupted), (signal.SIGKILL, signal.SIGINT), strict=True
+        ):
+            wait_for_checkpoint(chosen.run_folder, process)
+            process.send_signal(number)
+        errors = [process.communicate(timeout=60)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    for chosen in (killed, interrupted):
+        assert load_policy_network(chosen.run_folder)[1]["checkpoint"]["step"] >= 10
+    assert processes[1].returncode == 130
+    assert errors[1].strip().splitlines()[-1] == "interrupted" and "Traceback" not in errors[1]
+    run = Run.open(interrupted.run_folder)
+    assert run.checkpoints()[-1].name == f"step-{max(row['step'] for row in run.metrics()):08d}"
+
+
+def test_training_works_outside_the_main_thread(settings: Make) -> None:
+    done: list[Run] = []
+    thread = threading.Thread(target=lambda: done.append(train(settings(steps=2))))
+    thread.start()
+    thread.join(60)
+    assert done and done[0].checkpoint().name == "step-00000002"

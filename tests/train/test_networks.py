@@ -1,0 +1,167 @@
+"""Networks: split heads against unsplit ones, trunks that run once, batch normalisation that stays as it is."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from graspq.common.errors import UserError
+from graspq.train.default_network import DefaultNetwork
+from graspq.train.networks import NETWORKS, NetworkSpecification, QNetwork, make_network
+from graspq.train.paper_network import PaperNetwork
+from graspq.train.state import seeded
+
+BATCH, CANDIDATES = 3, 5
+
+
+def specification(name: str, size: int = 64, link: str = "logistic") -> NetworkSpecification:
+    return NetworkSpecification(name, (size, size, 3), 4, 15, link)  # type: ignore[arg-type]
+
+
+def made(name: str, size: int = 64) -> QNetwork:
+    """A network in evaluation mode with weights, gains and statistics away from their special starting values."""
+    network = make_network(specification(name, size), seeded("tests/weights")).train()
+    generator = seeded("tests/shake")
+    for parameter in network.parameters():
+        parameter.data += 0.1 * (torch.rand(parameter.shape, generator=generator) - 0.5)
+    with torch.no_grad():
+        for _ in range(30):
+            network.trunk(*states(size)[:2])
+    return network.eval()
+
+
+def states(size: int = 64) -> tuple[Tensor, Tensor, Tensor]:
+    generator = seeded("tests/states")
+    image = torch.randint(0, 256, (BATCH, size, size, 3), dtype=torch.uint8, generator=generator)
+    return image, torch.tensor([0, 3, 14]), torch.rand(BATCH, CANDIDATES, 4, generator=generator) * 2 - 1
+
+
+@pytest.fixture(params=list(NETWORKS))
+def network(request: pytest.FixtureRequest) -> Iterator[QNetwork]:
+    yield made(request.param)
+
+
+@torch.no_grad()
+def test_the_head_on_trunk_features_equals_the_whole_network_on_each_action(network: QNetwork) -> None:
+    image, step, action = states()
+    features = network.trunk(image, step)
+    together = network.head(features, action)
+    assert together.shape == (BATCH, CANDIDATES) and together.dtype == torch.float32
+    for index in range(CANDIDATES):
+        alone = network(image, step, action[:, index])
+        torch.testing.assert_close(together[:, index], alone, rtol=1e-5, atol=1e-5)
+    assert float(together.std(dim=1).min()) > 1e-4, "the action makes no difference"
+    assert float(together.std(dim=0).min()) > 1e-4, "the state makes no difference"
+
+
+@torch.no_grad()
+def test_the_paper_network_equals_its_unsplit_form() -> None:
+    network = made("paper")
+    assert isinstance(network, PaperNetwork)
+    image, step, action = states()
+    state_map = network.state_map(image, step)
+    assert state_map.shape == (BATCH, 33, 7, 7)
+    for index in range(CANDIDATES):
+        embedding = network.action_norm(network.action(action[:, index]))
+        joined = state_map + embedding.view(BATCH, 33, 1, 1)
+        hidden = network.first_norm(network.first(joined.flatten(1)))
+        expected = network.last(network.second_norm(network.second(hidden))).squeeze(1)
+        split = network(image, step, action[:, index])
+        torch.testing.assert_close(split, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_paper_network_has_the_papers_sizes() -> None:
+    network = make_network(specification("paper"), seeded("tests/weights"))
+    shapes = {name: list(value.shape) for name, value in network.named_parameters() if value.dim() > 1}
+    assert shapes == {
+        "convolutions.0.weight": [32, 3, 3, 3],
+        "convolutions.1.weight": [32, 32, 3, 3],
+        "convolutions.2.weight": [32, 32, 3, 3],
+        "action.weight": [33, 4],
+        "first.weight": [32, 33 * 7 * 7],
+        "second.weight": [32, 32],
+        "last.weight": [1, 32],
+    }
+    assert sum(parameter.numel() for parameter in network.parameters()) == 72_615
+    weights = torch.cat([value.detach().flatten() for value in network.parameters() if value.dim() > 1])
+    assert float(weights.abs().max()) <= 0.02 and 0.0085 < float(weights.std()) < 0.009
+
+
+@torch.no_grad()
+def test_layer_normalisation_of_the_paper_network_is_over_height_width_and_channels() -> None:
+    network = make_network(specification("paper"), seeded("tests/weights"))
+    assert isinstance(network, PaperNetwork)
+    x = torch.rand(2, 32, 5, 5, generator=seeded("tests/x"))
+    expected = functional.relu(functional.layer_norm(x, [32, 5, 5], eps=1e-12))
+    torch.testing.assert_close(network.convolution_norms[0](x), expected, rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_candidates_never_run_the_trunk_again(network: QNetwork) -> None:
+    runs = []
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            module.register_forward_hook(lambda *_: runs.append(1))
+    image, step, action = states()
+    q_of_actions = network.at(image, step)
+    convolutions = len(runs)
+    assert convolutions >= 3
+    for _ in range(3):
+        q_of_actions(action)
+    assert len(runs) == convolutions
+
+
+@torch.no_grad()
+def test_evaluation_passes_leave_batch_statistics_alone_and_do_not_use_the_batchs() -> None:
+    network = made("default")
+    before = {name: buffer.clone() for name, buffer in network.named_buffers()}
+    image, step, action = states()
+    together = network(image, step, action[:, 0])
+    alone = torch.cat([network(image[i : i + 1], step[i : i + 1], action[i : i + 1, 0]) for i in range(BATCH)])
+    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
+    for name, buffer in network.named_buffers():
+        assert torch.equal(buffer, before[name]), name
+
+
+def test_attention_can_tell_apart_places_that_look_alike() -> None:
+    network = make_network(specification("default"), seeded("tests/weights"))
+    assert isinstance(network, DefaultNetwork)
+    # A query without content that asks for large x: the map's right half is marked.
+    values = torch.zeros(1, 256, 64)
+    values.view(1, 16, 16, 64)[:, :, 8:] = 1.0
+    place = torch.zeros(1, 4, 81)
+    place[..., 64] = 100.0
+    attended = network._attend(place, values)
+    torch.testing.assert_close(attended, torch.ones(1, 4, 64), rtol=0, atol=1e-3)
+
+
+def test_q_is_a_probability_with_the_logistic_link_and_the_raw_output_without() -> None:
+    image, step, action = states()
+    for link in ("logistic", "identity"):
+        network = make_network(specification("paper", link=link), seeded("tests/weights")).eval()
+        raw = network(image, step, action[:, 0])
+        q = network.at(image, step)(action[:, :1]).squeeze(1)
+        torch.testing.assert_close(q, raw.sigmoid() if link == "logistic" else raw)
+
+
+def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
+    torch.manual_seed(1)
+    first = make_network(specification("default"), seeded("tests/weights", 0)).state_dict()
+    torch.manual_seed(2)
+    again = make_network(specification("default"), seeded("tests/weights", 0)).state_dict()
+    other = make_network(specification("default"), seeded("tests/weights", 1)).state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["last.weight"], other["last.weight"])
+
+
+@pytest.mark.parametrize(("name", "size"), [("default", 20), ("default", 8), ("paper", 14)])
+def test_images_that_a_network_cannot_take_are_refused_in_one_line(name: str, size: int) -> None:
+    with pytest.raises(UserError, match="images of"):
+        make_network(specification(name, size))
+
+
+def test_an_unknown_network_is_refused_with_the_choices() -> None:
+    with pytest.raises(UserError, match="choose from default, conv, paper"):
+        make_network(specification("resnet"))

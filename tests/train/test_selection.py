@@ -1,0 +1,81 @@
+"""Stochastic search on Q-functions whose best action is known."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from graspq.train.selection import cem_noise, cross_entropy_method, uniform_actions, uniform_search
+from graspq.train.state import seeded
+
+CENTRES = torch.tensor([[0.3, -0.6, 0.1, 0.8], [-0.2, 0.5, -0.9, 0.0]])
+
+
+def quadratic(action: Tensor) -> Tensor:
+    """Q of two states whose best actions are `CENTRES`."""
+    return 1 - (action - CENTRES.unsqueeze(1)).square().sum(-1)
+
+
+def test_the_cross_entropy_method_finds_the_maximum_of_a_quadratic() -> None:
+    errors = []
+    for seed in range(20):
+        choice = cross_entropy_method(quadratic, cem_noise(seeded("tests/cem", seed), batch=2))
+        errors.append((choice.action - CENTRES).abs().amax())
+    assert torch.stack(errors).mean() < 0.15
+    many = cem_noise(seeded("tests/cem", 0), batch=2, iterations=12, samples=256)
+    torch.testing.assert_close(cross_entropy_method(quadratic, many, elites=24).action, CENTRES, rtol=0, atol=0.01)
+
+
+def test_the_cross_entropy_method_reaches_a_maximum_on_the_border_and_stays_inside() -> None:
+    def beyond(action: Tensor) -> Tensor:
+        assert float(action.abs().max()) <= 1.0
+        return -(action - 2).square().sum(-1)
+
+    choice = cross_entropy_method(beyond, cem_noise(seeded("tests/cem"), batch=1, iterations=6))
+    torch.testing.assert_close(choice.action, torch.ones(1, 4), rtol=0, atol=0.02)
+
+
+def test_the_cross_entropy_method_returns_the_best_sample_it_has_met() -> None:
+    met: list[Tensor] = []
+
+    def remembered(action: Tensor) -> Tensor:
+        met.append(quadratic(action))
+        return met[-1]
+
+    choice = cross_entropy_method(remembered, cem_noise(seeded("tests/cem"), batch=2))
+    assert [list(q.shape) for q in met] == [[2, 64]] * 3
+    assert torch.equal(choice.q, torch.cat(met, dim=1).amax(1))
+    assert torch.equal(quadratic(choice.action.unsqueeze(1)).squeeze(1), choice.q)
+
+
+def test_the_first_iteration_covers_the_range_of_actions_evenly() -> None:
+    seen: list[Tensor] = []
+
+    def remembered(action: Tensor) -> Tensor:
+        seen.append(action)
+        return action.sum(-1)
+
+    cross_entropy_method(remembered, cem_noise(seeded("tests/cem"), batch=1, samples=20_000))
+    share = torch.histc(seen[0].flatten(), bins=10, min=-1, max=1) / seen[0].numel()
+    torch.testing.assert_close(share, torch.full((10,), 0.1), rtol=0, atol=0.005)
+
+
+def test_the_choice_of_a_state_does_not_depend_on_the_others_in_its_batch() -> None:
+    noise = cem_noise(seeded("tests/cem"), batch=2)
+    both = cross_entropy_method(quadratic, noise)
+    alone = cross_entropy_method(lambda action: quadratic(action.expand(2, -1, -1))[1:], noise[:, 1:])
+    assert torch.equal(both.action[1:], alone.action)
+
+
+def test_uniform_search_returns_the_best_candidate_and_its_q() -> None:
+    candidates = uniform_actions(seeded("tests/uniform"), batch=2, candidates=500)
+    assert candidates.shape == (2, 500, 4)
+    assert -1 <= float(candidates.min()) < -0.99 and 0.99 < float(candidates.max()) <= 1
+    choice = uniform_search(quadratic, candidates)
+    assert torch.equal(choice.q, quadratic(candidates).amax(1))
+    assert torch.equal(quadratic(choice.action.unsqueeze(1)).squeeze(1), choice.q)
+
+
+@pytest.mark.parametrize("elites", [1, 65])
+def test_an_impossible_number_of_elites_is_refused(elites: int) -> None:
+    with pytest.raises(ValueError, match="2 to 64 elites"):
+        cross_entropy_method(quadratic, cem_noise(seeded("tests/cem"), batch=2), elites=elites)

@@ -1,0 +1,63 @@
+"""Batches as tensors on the training device, in one shape for both views: a transition is an episode of T = 1.
+
+Dimensions: B batch, T steps, A action, H W C image.
+"""
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from graspq.datasets.batch import EpisodeBatch, TransitionBatch
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Batch:
+    """B transitions (T = 1) or B whole episodes padded to T steps.
+
+    Attributes:
+        image: uint8 [B, T, H, W, C], RGB before the action.
+        step: int64 [B, T].
+        action: float32 [B, T, A], in units of the action limits.
+        reward: float32 [B, T].
+        terminal: bool [B, T].
+        mc_return: float32 [B, T], with the dataset's discount.
+        synthetic_action: float32 [B, T, A], in the units of `action`.
+        next_image: uint8 [B, T, H, W, C], meaningless where terminal; None in episodes and where no target reads it.
+        next_step: int64 [B, T]; None as `next_image`.
+        mask: bool [B, T], false on padding; None where there is none.
+    """
+
+    image: Tensor
+    step: Tensor
+    action: Tensor
+    reward: Tensor
+    terminal: Tensor
+    mc_return: Tensor
+    synthetic_action: Tensor
+    next_image: Tensor | None = None
+    next_step: Tensor | None = None
+    mask: Tensor | None = None
+
+    def real(self, values: Tensor) -> Tensor:
+        """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""
+        flat = values.flatten(0, 1)
+        return flat if self.mask is None else flat[self.mask.flatten()]
+
+
+def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> Batch:
+    """Move a loader's batch to `device`; on the CPU without copying."""
+    transitions = isinstance(batch, TransitionBatch)
+
+    def tensor(array: np.ndarray) -> Tensor:
+        moved = torch.from_numpy(array).to(device, non_blocking=True)
+        return moved.unsqueeze(1) if transitions else moved
+
+    names = ("image", "step", "action", "reward", "terminal", "mc_return", "synthetic_action")
+    common = {name: tensor(getattr(batch, name)) for name in names}
+    if isinstance(batch, EpisodeBatch):
+        return Batch(**common, mask=tensor(batch.mask))
+    if batch.next_image is None:
+        return Batch(**common)
+    return Batch(**common, next_image=tensor(batch.next_image), next_step=tensor(batch.next_step))

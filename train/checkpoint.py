@@ -1,0 +1,201 @@
+"""Checkpoints: safetensors files and a JSON that names the SHA-256 of each; written whole or not at all, no pickle.
+
+A checkpoint is a folder `step-00000500` with one file for each network and optimiser, and `state.json`.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+from torch import Tensor, nn
+
+from graspq.common.errors import UserError
+from graspq.common.files import TEMPORARY_PREFIX, fsync_folder, read_json
+from graspq.train.networks import NetworkSpecification, QNetwork, make_network
+from graspq.train.run import Run, checkpoint_name, step_of
+from graspq.train.state import TrainState
+
+FORMAT = 1
+STATE_FILE = "state.json"
+REMEDY = "copy it again, or delete this checkpoint's folder to go on from the one before it"
+
+
+def save_checkpoint(folder: Path, state: TrainState, specification: NetworkSpecification) -> Path:
+    """Write `folder/step-NNNNNNNN` durably and return it; after a crash it is there whole or not at all.
+
+    Args:
+        folder: the run's `checkpoints`.
+        state: all of it is kept.
+        specification: how to build the networks again.
+    """
+    final = folder / checkpoint_name(state.step)
+    temporary = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-{final.name}"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    contents = {f"{name}.safetensors": network.state_dict() for name, network in state.networks.items()}
+    contents |= {f"{name}.safetensors": _moments(*pair) for name, pair in state.optimizers.items()}
+    files = {name: _write(temporary / name, _packed(tensors)) for name, tensors in contents.items()}
+    description = {"format": FORMAT, "step": state.step, "network": specification.to_json(), "files": files}
+    described = json.dumps(description | {"digest": _digest(description)}, indent=2) + "\n"
+    _write(temporary / STATE_FILE, described.encode())
+    fsync_folder(temporary)
+    if final.exists():
+        shutil.rmtree(final)
+    temporary.replace(final)
+    fsync_folder(folder)
+    return final
+
+
+def load_checkpoint(checkpoint: Path, state: TrainState, specification: NetworkSpecification) -> None:
+    """Fill a freshly made state with a checkpoint's: training goes on as if it had never stopped.
+
+    Raises:
+        UserError: the checkpoint is damaged, or of another network.
+    """
+    description = describe(checkpoint)
+    if description["network"] != specification.to_json():
+        raise UserError(
+            f"{checkpoint}: of another network: expected {specification.to_json()}, got {description['network']}; "
+            "choose another run folder with --out"
+        )
+    expected = {f"{name}.safetensors" for name in [*state.networks, *state.optimizers]}
+    if set(description["files"]) != expected:
+        raise UserError(f"{checkpoint}: expected {', '.join(sorted(expected))}; choose another run folder with --out")
+    for name, network in state.networks.items():
+        _fill(checkpoint / f"{name}.safetensors", network, read_tensors(checkpoint, description, name))
+    for name, (optimizer, trained) in state.optimizers.items():
+        _restore_moments(optimizer, trained, read_tensors(checkpoint, description, name))
+    state.step = int(description["step"])
+
+
+def load_policy_network(path: Path | str, step: int | None = None) -> tuple[QNetwork, dict[str, Any]]:
+    """Return the network that a run's policy uses, in evaluation mode on the CPU, and the run's configuration.
+
+    Args:
+        path: a run folder, or one of its checkpoints.
+        step: training step of the checkpoint; the newest where not given.
+
+    Returns:
+        The averaged network where the run kept one, else the trained one; and `config.json` with an entry
+        `"checkpoint": {"step", "path", "sha256"}` for the weights that were loaded.
+
+    Raises:
+        UserError: there is no run or no such checkpoint, or it is damaged or of another network.
+    """
+    path = Path(path)
+    given = (path / STATE_FILE).is_file()
+    run = Run.open(path.absolute().parent.parent if given else path)
+    checkpoint = path if given and step is None else run.checkpoint(step)
+    description = describe(checkpoint)
+    specification = NetworkSpecification.from_json(description["network"])
+    if run.config.get("network") != description["network"]:
+        raise UserError(
+            f"{checkpoint}: of another network than its run: config.json says {run.config.get('network')}, "
+            f"the checkpoint {description['network']}; copy the run again"
+        )
+    name = "averaged" if "averaged.safetensors" in description["files"] else "network"
+    network = make_network(specification)
+    _fill(checkpoint / f"{name}.safetensors", network, read_tensors(checkpoint, description, name))
+    loaded = {
+        "step": int(description["step"]),
+        "path": str(checkpoint),
+        "sha256": description["files"][f"{name}.safetensors"],
+    }
+    return network.eval().requires_grad_(False), run.config | {"checkpoint": loaded}
+
+
+def describe(checkpoint: Path) -> dict[str, Any]:
+    """Return a checkpoint's `state.json`.
+
+    Raises:
+        UserError: it is missing or damaged, or the folder was renamed.
+    """
+    description = read_json(checkpoint / STATE_FILE, "checkpoint")
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
+        raise UserError(f"{checkpoint / STATE_FILE}: expected a checkpoint of format {FORMAT}; train again")
+    if description.pop("digest", None) != _digest(description):
+        raise UserError(f"{checkpoint / STATE_FILE}: damaged, its digest does not fit; {REMEDY}")
+    if step_of(checkpoint) not in (None, description["step"]):
+        raise UserError(f"{checkpoint}: holds step {description['step']}; give the folder its own name again")
+    return description
+
+
+def read_tensors(checkpoint: Path, description: dict[str, Any], name: str) -> dict[str, Tensor]:
+    """Return the tensors of one file of a checkpoint after checking its SHA-256.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    path = checkpoint / f"{name}.safetensors"
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from None
+    if hashlib.sha256(content).hexdigest() != description["files"].get(path.name):
+        raise UserError(f"{path}: damaged, its SHA-256 is not that of {STATE_FILE}; {REMEDY}")
+    try:
+        return safetensors.torch.load(content)
+    except SafetensorError as error:
+        raise UserError(f"{path}: no safetensors file ({error}); {REMEDY}") from None
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what killed writers of checkpoints left; the caller holds the run's lock."""
+    for leftover in folder.glob(f"{TEMPORARY_PREFIX}*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _packed(tensors: dict[str, Tensor]) -> bytes:
+    # Contiguous: safetensors knows no memory format; the layout is the network's, and is restored on loading.
+    return safetensors.torch.save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
+
+
+def _write(path: Path, content: bytes) -> str:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    return hashlib.sha256(content).hexdigest()
+
+
+def _digest(description: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
+
+
+def _fill(path: Path, network: QNetwork, tensors: dict[str, Tensor]) -> None:
+    expected = {name: list(tensor.shape) for name, tensor in network.state_dict().items()}
+    found = {name: list(tensor.shape) for name, tensor in tensors.items()}
+    if found != expected:
+        wrong = min(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
+        raise UserError(
+            f"{path}: of another network: {wrong} should be {expected.get(wrong, 'absent')}, "
+            f"is {found.get(wrong, 'absent')}; use a checkpoint of this network"
+        )
+    network.load_state_dict(tensors)
+
+
+def _moments(optimizer: torch.optim.Optimizer, network: nn.Module) -> dict[str, Tensor]:
+    """Return the optimiser's tensors, named `exp_avg/head.weight` and so on."""
+    return {
+        f"{key}/{name}": value
+        for name, parameter in network.named_parameters()
+        for key, value in optimizer.state.get(parameter, {}).items()
+    }
+
+
+def _restore_moments(optimizer: torch.optim.Optimizer, network: nn.Module, tensors: dict[str, Tensor]) -> None:
+    parameters = dict(network.named_parameters())
+    for label, tensor in tensors.items():
+        key, name = label.split("/", 1)
+        if name not in parameters or (tensor.dim() > 0 and tensor.shape != parameters[name].shape):
+            raise UserError(f"optimiser state {label}: of another network; choose another run folder with --out")
+        parameter = parameters[name]
+        # The moments lie in memory as the weights do; a step counter is a scalar.
+        restored = torch.empty_like(parameter, requires_grad=False) if tensor.dim() > 0 else torch.empty_like(tensor)
+        optimizer.state[parameter][key] = restored.to(parameter.device).copy_(tensor)

@@ -1,0 +1,96 @@
+"""The network of the paper's released code: three convolutions, layer normalisation, about 73k weights.
+
+It gives the same Q as the released graph but computes the image's part of the first fully connected layer once a state.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from graspq.common.errors import UserError
+from graspq.train.networks import Features, NetworkSpecification, QNetwork
+
+CHANNELS = 32
+INITIAL_DEVIATION = 0.01
+EPSILON = 1e-12
+
+
+class _LayerNorm(nn.Module):
+    """Layer normalisation over all but the batch's dimensions, with one gain and bias a channel, then ReLU.
+
+    Acts on [B, C, H, W] (statistics over C, H and W) and on [..., C] (over C).
+    """
+
+    def __init__(self, channels: int, *, spatial: bool) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.spatial = spatial
+
+    def forward(self, x: Tensor) -> Tensor:
+        dimensions = (1, 2, 3) if self.spatial else (-1,)
+        shape = (1, -1, 1, 1) if self.spatial else (-1,)
+        variance, mean = torch.var_mean(x.float(), dim=dimensions, correction=0, keepdim=True)
+        scaled = (x - mean) * torch.rsqrt(variance + EPSILON)
+        return functional.relu(scaled * self.gain.view(shape) + self.bias.view(shape))
+
+
+class PaperNetwork(QNetwork):
+    """`cnn_ia_v1` of the released code.
+
+    Three 3×3 convolutions of 32 channels, stride 2, no padding, on the raw 0..255 image; the raw step tiled as a 33rd
+    channel; the action through a fully connected layer of 33, added at every position; then fully connected layers of
+    32, 32 and 1. Every layer but the last is normalised (`_LayerNorm`) and has no bias of its own. All weights start
+    from a normal distribution with deviation 0.01, truncated at two deviations.
+
+    FC₁(M + tile(e)) = FC₁(M) + (Σₚ W₁ₚ) e splits the first layer after the action: FC₁(M) is the trunk's, and a
+    candidate costs 2.2k multiplications rather than 53k.
+
+    Source: the paper's figure 3; released code, `tf_critics.py` and `tf_modules.py`.
+    Differs: images of any size from 15×15 (the released code's were 64×64 and so are ours).
+    """
+
+    def __init__(self, specification: NetworkSpecification) -> None:
+        super().__init__()
+        height, width, channels = specification.image_shape
+        for _ in range(3):
+            height, width = (height - 1) // 2, (width - 1) // 2
+        if min(height, width) < 1:
+            raise UserError(f"images of {specification.image_shape}: the paper's network needs at least 15 x 15 pixels")
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(inputs, CHANNELS, 3, stride=2, bias=False) for inputs in (channels, CHANNELS, CHANNELS)
+        )
+        self.convolution_norms = nn.ModuleList(_LayerNorm(CHANNELS, spatial=True) for _ in range(3))
+        self.action = nn.Linear(specification.actions, CHANNELS + 1, bias=False)
+        self.action_norm = _LayerNorm(CHANNELS + 1, spatial=False)
+        self.first = nn.Linear((CHANNELS + 1) * height * width, CHANNELS, bias=False)
+        self.first_norm = _LayerNorm(CHANNELS, spatial=False)
+        self.second = nn.Linear(CHANNELS, CHANNELS, bias=False)
+        self.second_norm = _LayerNorm(CHANNELS, spatial=False)
+        self.last = nn.Linear(CHANNELS, 1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.Linear):
+                bound = 2 * INITIAL_DEVIATION
+                nn.init.trunc_normal_(module.weight, std=INITIAL_DEVIATION, a=-bound, b=bound)
+        nn.init.zeros_(self.last.bias)
+
+    def state_map(self, image: Tensor, step: Tensor) -> Tensor:
+        """Return the map M of states with the step as its last channel; float32 [B, 33, H', W']."""
+        x = image.permute(0, 3, 1, 2).float()
+        for convolution, norm in zip(self.convolutions, self.convolution_norms, strict=True):
+            x = norm(convolution(x))
+        tiled = step.to(x.dtype).view(-1, 1, 1, 1).expand(-1, 1, *x.shape[2:])
+        return torch.cat([x, tiled], dim=1)
+
+    def trunk(self, image: Tensor, step: Tensor) -> Features:
+        """Return FC₁(M), float [B, 32]; see `QNetwork.trunk`."""
+        return (self.first(self.state_map(image, step).flatten(1)),)
+
+    def head(self, features: Features, action: Tensor) -> Tensor:
+        """Return raw outputs [B, N]; see `QNetwork.head`."""
+        embedding = self.action_norm(self.action(action))
+        summed = self.first.weight.view(CHANNELS, CHANNELS + 1, -1).sum(2)
+        hidden = self.first_norm(features[0].unsqueeze(1) + functional.linear(embedding, summed))
+        hidden = self.second_norm(self.second(hidden))
+        output: Tensor = self.last(hidden)
+        return output.squeeze(-1).float()

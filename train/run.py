@@ -1,0 +1,182 @@
+"""A run folder: its configuration, metrics and checkpoints, and the lock that keeps two trainings out of one folder.
+
+It holds `config.json`, `metrics.jsonl`, `tensorboard/` and `checkpoints/step-NNNNNNNN/`.
+"""
+
+import contextlib
+import fcntl
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.files import read_json, remove_temporaries, writable_folder, write_json, write_text
+
+# Settings that may differ when a run is resumed: they do not decide what is learned.
+FREE_SETTINGS = frozenset(
+    {
+        "shards",  # the data may have moved: their digest is compared instead
+        "out",
+        "validation_transitions",
+        "validate_every",
+        "checkpoint_every",
+        "keep_checkpoints",
+        "log_every",
+        "device",
+        "precision",
+        "threads",
+    }
+)
+
+
+def checkpoint_name(step: int) -> str:
+    """Return the name of a checkpoint's folder."""
+    return f"step-{step:08d}"
+
+
+def step_of(checkpoint: Path) -> int | None:
+    """Return the step in the name of a checkpoint's folder; None for other folders."""
+    match = re.fullmatch(r"step-(\d{8,})", checkpoint.name)
+    return int(match[1]) if match is not None else None
+
+
+class Run:
+    """A run folder that exists.
+
+    Attributes:
+        folder: the folder.
+        config: the content of `config.json`.
+    """
+
+    def __init__(self, folder: Path, config: dict[str, Any]) -> None:
+        self.folder, self.config = folder, config
+
+    @classmethod
+    def open(cls, folder: Path | str) -> "Run":
+        """Return the run in `folder`.
+
+        Raises:
+            UserError: there is none.
+        """
+        folder = Path(folder)
+        config = read_json(folder / "config.json", "training run (config.json)")
+        if not isinstance(config, dict) or "settings" not in config:
+            raise UserError(f"{folder / 'config.json'}: not the configuration of a training run; name another folder")
+        return cls(folder, config)
+
+    @classmethod
+    def create_or_resume(cls, folder: Path, config: dict[str, Any]) -> "Run":
+        """Return the run of this configuration in `folder`: a new one, or the one that is there.
+
+        A run that is there keeps its own `config.json`.
+
+        Raises:
+            UserError: the folder holds something else or a run of another configuration, or cannot be written.
+        """
+        writable_folder(folder, "run")
+        if not (folder / "config.json").exists():
+            if any(not path.name.startswith(".") for path in folder.iterdir()):
+                raise UserError(f"{folder}: not empty and not a training run; choose another folder with --out")
+            write_json(folder / "config.json", config)
+            return cls(folder, config)
+        run = cls.open(folder)
+        run._refuse_other(config)
+        return run
+
+    def _refuse_other(self, config: dict[str, Any]) -> None:
+        ours, theirs = self.config["settings"], config["settings"]
+        for name in sorted((ours.keys() | theirs.keys()) - FREE_SETTINGS):
+            if ours.get(name) != theirs.get(name):
+                raise UserError(
+                    f"{self.folder}: holds a run with {name} = {ours.get(name)}, not {theirs.get(name)}; "
+                    "choose another folder with --out, or delete it"
+                )
+        for part in ("network", "dataset"):
+            if self.config.get(part) != config[part]:
+                raise UserError(
+                    f"{self.folder}: holds a run with another {part} ({self.config.get(part)}, now {config[part]}); "
+                    "choose another folder with --out, or delete it"
+                )
+
+    def note(self, name: str, value: Any) -> None:
+        """Add an entry to `config.json`."""
+        self.config[name] = value
+        write_json(self.folder / "config.json", self.config)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the run for this process alone.
+
+        Raises:
+            UserError: another process trains in it.
+        """
+        with (self.folder / ".lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise UserError(f"{self.folder}: another process trains here; wait for it, or use --out") from None
+            remove_temporaries(self.folder)
+            yield
+
+    @property
+    def checkpoints_folder(self) -> Path:
+        """Where the checkpoints are."""
+        return self.folder / "checkpoints"
+
+    def checkpoints(self) -> list[Path]:
+        """Return the checkpoints' folders, oldest first."""
+        found = [(step_of(path), path) for path in self.checkpoints_folder.glob("step-*")]
+        return [path for step, path in sorted((step, path) for step, path in found if step is not None)]
+
+    def latest_checkpoint(self) -> Path | None:
+        """Return the newest checkpoint, or None before the first."""
+        return next(reversed(self.checkpoints()), None)
+
+    def checkpoint(self, step: int | None = None) -> Path:
+        """Return the checkpoint of a step, or the newest.
+
+        Raises:
+            UserError: there is none.
+        """
+        known = {step_of(path): path for path in self.checkpoints()}
+        if not known:
+            raise UserError(f"{self.folder}: has no checkpoint yet; let grasp-train run on")
+        if step is not None and step not in known:
+            raise UserError(f"{self.folder}: has no checkpoint of step {step}, only of {', '.join(map(str, known))}")
+        return known[step] if step is not None else self.checkpoints()[-1]
+
+    def prune(self, keep: int) -> None:
+        """Remove all but the newest `keep` checkpoints."""
+        for path in self.checkpoints()[:-keep]:
+            shutil.rmtree(path)
+
+    @property
+    def metrics_file(self) -> Path:
+        """Where the metrics are."""
+        return self.folder / "metrics.jsonl"
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Return the rows of `metrics.jsonl`; a line that a crash cut short is left out.
+
+        A row of training has `step, loss, samples_per_second, learning_rate`, one of validation
+        `step, validation: {...}`; see `validation.Validation`.
+        """
+        if not self.metrics_file.exists():
+            return []
+        lines = self.metrics_file.read_text().split("\n")
+        # Only a line that ends was written whole.
+        return [json.loads(line) for line in lines[:-1] if line]
+
+    def append_metrics(self, row: dict[str, Any]) -> None:
+        """Add a row to `metrics.jsonl`."""
+        with self.metrics_file.open("a") as file:
+            file.write(json.dumps(row, allow_nan=False) + "\n")
+
+    def forget_after(self, step: int) -> None:
+        """Drop the metrics of later steps, which will be taken again."""
+        rows = [row for row in self.metrics() if row["step"] <= step]
+        if self.metrics_file.exists():
+            write_text(self.metrics_file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))

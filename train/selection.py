@@ -1,0 +1,109 @@
+"""How an action is picked from a Q-function: stochastic search, by uniform draws or by the cross-entropy method.
+
+Both are pure functions of a Q-function of actions and of random numbers that the caller draws, so that one state's
+choice does not depend on which other states share its batch. Dimensions: B batch, N candidates, A action, I iterations.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+QOfActions = Callable[[Tensor], Tensor]
+"""Q of candidate actions, [B, N, A] -> [B, N], for B states that are fixed inside it."""
+
+
+class Choice(NamedTuple):
+    """The best action found for each state, and its Q.
+
+    `action` is float [B, A] in units of the action limits, in [-1, 1]; `q` is float [B], on the scale of the Q-function
+    that was searched.
+    """
+
+    action: Tensor
+    q: Tensor
+
+
+def uniform_actions(generator: torch.Generator, batch: int, candidates: int = 16, dimensions: int = 4) -> Tensor:
+    """Draw candidate actions aᵢ ~ U[-1, 1]ᴬ on the generator's device; float32 [B, N, A]."""
+    draws = torch.rand(batch, candidates, dimensions, generator=generator, device=generator.device)
+    return draws * 2 - 1
+
+
+def cem_noise(
+    generator: torch.Generator, batch: int, iterations: int = 3, samples: int = 64, dimensions: int = 4
+) -> Tensor:
+    """Draw the standard normal numbers of a `cross_entropy_method` on the generator's device; float32 [I, B, N, A]."""
+    return torch.randn(iterations, batch, samples, dimensions, generator=generator, device=generator.device)
+
+
+def uniform_search(q_of_actions: QOfActions, candidates: Tensor) -> Choice:
+    """Return the best of the given candidates.
+
+        a* = argmaxᵢ Q(s, aᵢ)
+
+    Args:
+        q_of_actions: Q-function of candidates.
+        candidates: float [B, N, A] in [-1, 1]; see `uniform_actions`.
+
+    Returns:
+        The choice; the first of equals.
+
+    Source: Quillen et al. 2018, section "Off-Policy Q-Learning" (16 uniform actions).
+    """
+    return _best(candidates, q_of_actions(candidates))
+
+
+def cross_entropy_method(q_of_actions: QOfActions, noise: Tensor, *, elites: int = 6) -> Choice:
+    """Return the best action that the cross-entropy method meets.
+
+        first iteration:   aᵢ = 2 Φ(εᵢ) - 1, uniform on [-1, 1]ᴬ
+        later iterations:  aᵢ = clip(μ + σ εᵢ, -1, 1),  μ, σ = mean and standard deviation (n - 1) of the elites
+
+    Args:
+        q_of_actions: Q-function of candidates.
+        noise: standard normal numbers, float [I, B, N, A]; its shape says how many iterations and samples there are.
+            See `cem_noise`.
+        elites: how many of the N samples the next iteration's normal distribution is fitted to, 2 to N.
+
+    Returns:
+        The best of all I·N samples of each state.
+
+    Raises:
+        ValueError: `noise` has not four dimensions or `elites` is not between 2 and N.
+
+    Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning" (3 iterations, 64 samples).
+    Differs: the released code starts from a normal distribution around (0, 0, -1, 0) with deviation 0.5, keeps 10
+    elites, does not clip, and takes the best of the last iteration alone. Here the first iteration covers the whole
+    range of actions evenly, and no good sample is forgotten.
+    """
+    if noise.dim() != 4 or not 2 <= elites <= noise.shape[2]:
+        raise ValueError(
+            f"expected noise [iterations, batch, samples, action] and 2 to {noise.shape[-2]} elites, "
+            f"got noise {list(noise.shape)} and {elites} elites"
+        )
+    candidates = 2 * torch.special.ndtr(noise[0]) - 1
+    q = q_of_actions(candidates)
+    best = _best(candidates, q)
+    for epsilon in noise[1:]:
+        chosen = q.topk(elites, dim=1).indices
+        elite = candidates.gather(1, chosen.unsqueeze(-1).expand(-1, -1, candidates.shape[-1]))
+        deviation, mean = torch.std_mean(elite, dim=1, keepdim=True)
+        candidates = (mean + deviation * epsilon).clamp(-1, 1)
+        q = q_of_actions(candidates)
+        best = _better(best, _best(candidates, q))
+    return best
+
+
+def _best(candidates: Tensor, q: Tensor) -> Choice:
+    index = q.argmax(dim=1)
+    rows = torch.arange(len(index), device=index.device)
+    return Choice(candidates[rows, index], q[rows, index])
+
+
+def _better(first: Choice, second: Choice) -> Choice:
+    improved = second.q > first.q
+    return Choice(
+        torch.where(improved.unsqueeze(-1), second.action, first.action), torch.where(improved, second.q, first.q)
+    )

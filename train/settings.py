@@ -1,0 +1,183 @@
+"""All settings of a training run, and the presets that give groups of them their values at once.
+
+`TrainSettings` is complete; `TrainOptions` is what a command line gives, where None means that the preset decides.
+"""
+
+import dataclasses
+import re
+import typing
+from pathlib import Path
+from typing import Any, Literal
+
+from graspq.common.errors import UserError
+from graspq.common.options import Settings, parse_count, setting
+from graspq.datasets.loader import DEFAULT_BUFFER_BYTES
+from graspq.train.estimators import ESTIMATORS, estimator_named
+from graspq.train.updates import LossName
+
+PresetName = Literal["default", "paper"]
+
+PRESETS: dict[PresetName, dict[str, Any]] = {
+    "default": {
+        "steps": 8_000,
+        "network": "default",
+        "loss": "cross-entropy",
+        "batch_size": 256,
+        "learning_rate": 2e-3,
+        "weight_decay": 0.02,
+        "schedule": "cosine",
+        "warmup": 0.1,
+        "average_decay": 0.999,
+        "shift": 4,
+        "mirror": True,
+        "jitter": 0.0,
+    },
+    # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
+    "paper": {
+        "steps": 2_000_000,
+        "network": "paper",
+        "loss": "squared",
+        "batch_size": 32,
+        "learning_rate": 1e-3,
+        "weight_decay": 0.0,
+        "schedule": "constant",
+        "warmup": 0.0,
+        "average_decay": 0.0,
+        "shift": 0,
+        "mirror": False,
+        "jitter": 0.0,
+    },
+}
+
+
+def _preset_setting(name: str, *, help: str, **more: Any) -> Any:
+    values = {preset: PRESETS[preset][name] for preset in PRESETS}
+    shown = "; ".join(f"{preset}: {value}" for preset, value in values.items())
+    return setting(values["default"], help=f"{help} [{shown}]", **more)
+
+
+def _algorithm(text: str) -> str:
+    estimator_named(text)
+    return text
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainSettings(Settings):
+    """Settings of `grasp-train`; each field's help says what it is."""
+
+    algo: str = setting(
+        help="Estimator: " + "; ".join(f"{name}: {row.summary}" for name, row in ESTIMATORS.items()) + ".",
+        parse=_algorithm,
+        metavar="|".join(ESTIMATORS),
+    )
+    shards: tuple[str, ...] = setting(help="Dataset folders, shard files or globs; several may follow.")
+    out: Path | None = setting(None, help="Run folder; runs/ALGO-DATASET-seedSEED where it is not given.")
+    seed: int = setting(0, help="Seed of weights, sample order, augmentation and candidates.", minimum=0)
+    preset: PresetName = setting("default", help="Values of all options marked with two values in brackets.")
+    steps: int = _preset_setting("steps", help="Gradient steps, such as 8000 or 8k.", minimum=1, parse=parse_count)
+    network: Literal["default", "conv", "paper"] = _preset_setting(
+        "network", help="Q-network; conv is the default one without attention."
+    )
+    loss: LossName = _preset_setting("loss", help="Loss between Q and target.")
+    batch_size: int = _preset_setting("batch_size", help="Transitions of a gradient step.", minimum=2)
+    learning_rate: float = _preset_setting("learning_rate", help="Highest learning rate of AdamW.", minimum=0)
+    weight_decay: float = _preset_setting(
+        "weight_decay", help="Decoupled weight decay of matrices and filters; 0 is Adam.", minimum=0
+    )
+    schedule: Literal["cosine", "constant"] = _preset_setting(
+        "schedule", help="Learning rate after warming up: cosine falls to 0 at the last step."
+    )
+    warmup: float = _preset_setting(
+        "warmup", help="Part of the steps in which the learning rate rises linearly, 0 to 1.", minimum=0, maximum=1
+    )
+    average_decay: float = _preset_setting(
+        "average_decay",
+        help="Decay of the moving average of weights that policies use, below 1; 0 uses the weights themselves.",
+        minimum=0,
+        maximum=0.999999,
+    )
+    shift: int = _preset_setting("shift", help="Largest random shift of images, pixels.", minimum=0, maximum=32)
+    mirror: bool = _preset_setting("mirror", help="Mirror half of each batch about the scene's plane of symmetry.")
+    jitter: float = _preset_setting(
+        "jitter", help="Largest random relative change of contrast and brightness.", minimum=0, maximum=1
+    )
+    discount: float | None = setting(
+        None, help="Discount of bootstrapped targets, 0 to 1; 0.9 where it is not given.", minimum=0, maximum=1
+    )
+    lag_steps: int = setting(50, help="Steps between copies of the weights into the lagged network.", minimum=1)
+    candidates: int = setting(16, help="Uniform actions among which a target looks for the best.", minimum=1)
+    validation_fraction: float = setting(
+        0.05, help="Part of the blocks held back for validation, 0 to below 1.", minimum=0, maximum=0.9
+    )
+    validation_transitions: int = setting(8192, help="Most held-back transitions of a validation.", minimum=1)
+    validate_every: int = setting(500, help="Steps between validations.", minimum=1)
+    checkpoint_every: int = setting(500, help="Steps between checkpoints.", minimum=1)
+    keep_checkpoints: int = setting(3, help="How many of the newest checkpoints are kept.", minimum=1)
+    log_every: int = setting(50, help="Steps between rows of metrics.jsonl.", minimum=1)
+    buffer_bytes: int = setting(
+        DEFAULT_BUFFER_BYTES,
+        help="Memory for decoded data, bytes; a dataset that fits is read once.",
+        minimum=1,
+    )
+    device: Literal["auto", "cpu", "cuda"] = setting("auto", help="Where to train; auto takes a GPU if there is one.")
+    precision: Literal["auto", "float32", "bfloat16"] = setting(
+        "auto", help="Arithmetic of the networks; auto tries both at the start and takes the faster right one."
+    )
+    threads: int | None = setting(None, help="CPU threads of torch; its own choice where not given.", minimum=1)
+
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UserError: a value is unknown or out of range.
+        """
+        super().__post_init__()
+        estimator_named(self.algo)
+        if not self.shards:
+            raise UserError("--shards: expected dataset folders, shard files or globs, got none")
+
+    @property
+    def run_folder(self) -> Path:
+        """The run folder: `out`, or its default."""
+        if self.out is not None:
+            return self.out
+        path = Path(self.shards[0])
+        named = path.parent.parent if path.suffix == ".parquet" else path
+        dataset = re.sub(r"[^A-Za-z0-9._-]+", "-", named.absolute().name).strip("-") or "data"
+        return Path("runs") / f"{self.algo}-{dataset}-seed{self.seed}"
+
+
+def _options_type() -> type[Settings]:
+    """Return the dataclass of the command line: `TrainSettings` with None where a preset has a value."""
+    hints = typing.get_type_hints(TrainSettings)
+    fields: list[Any] = []
+    for field in dataclasses.fields(TrainSettings):
+        governed = field.name in PRESETS["default"]
+        hint = hints[field.name] | None if governed else hints[field.name]
+        default = None if governed else field.default
+        fields.append((field.name, hint, dataclasses.field(default=default, metadata=field.metadata)))
+    made: type[Settings] = dataclasses.make_dataclass("TrainOptions", fields, bases=(Settings,), frozen=True)
+    return made
+
+
+TrainOptions = _options_type()
+
+
+def resolve(options: Settings) -> TrainSettings:
+    """Return complete settings: the preset's values wherever an option was not given.
+
+    Args:
+        options: `TrainOptions`.
+
+    Raises:
+        UserError: a value is unknown or out of range.
+    """
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    preset = PRESETS[given["preset"]]
+    values: dict[str, Any] = {name: preset.get(name) if value is None else value for name, value in given.items()}
+    return TrainSettings(**values)
+
+
+def preset_settings(preset: PresetName, **given: Any) -> TrainSettings:
+    """Return the settings of a preset with those given on top, as the command line would."""
+    return TrainSettings(**PRESETS[preset] | {"preset": preset} | given)

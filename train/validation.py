@@ -1,0 +1,136 @@
+"""How good a Q-function is on grasps it was not trained on: loss, calibration and ROC AUC.
+
+Calibration and AUC look at last steps alone: there Q(s, a) is the chance of success for every estimator, whatever its
+target is before. Dimensions: n last steps.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from graspq.train.batch import Batch
+from graspq.train.estimators import Estimator
+from graspq.train.state import Context
+from graspq.train.updates import loss_of, target_of
+
+Floats = npt.NDArray[np.floating[Any]]
+BINS = 10
+SURE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Validation:
+    """Measures on held-back transitions.
+
+    Attributes:
+        transitions: how many were looked at.
+        last_steps: how many of them were the last of their episode.
+        loss: mean loss against the estimator's own target; compares runs of one estimator and one loss.
+        loss_last_step: mean cross-entropy between Q and the reward at last steps, nats; compares all runs.
+        roc_auc_last_step: chance that a success has a higher Q than a failure, at last steps; None without both.
+        calibration_error: mean distance of Q and the rate of success over bins of Q, weighted by their counts.
+        calibration: 10 equal bins of Q in [0, 1]: `low, high, count, mean_q, success_rate` (None where empty).
+    """
+
+    transitions: int
+    last_steps: int
+    loss: float
+    loss_last_step: float | None
+    roc_auc_last_step: float | None
+    calibration_error: float | None
+    calibration: list[dict[str, float | int | None]]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the measures as plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+@torch.no_grad()
+def validate(batches: Iterable[Batch], estimator: Estimator, context: Context) -> Validation | None:
+    """Judge the context's network on batches, in evaluation mode; None where there are none."""
+    context.network.eval()
+    total, count = 0.0, 0
+    scores, rewards = [], []
+    for batch in batches:
+        target = target_of(batch, estimator, context)
+        total += float(loss_of(batch, target, estimator, context)) * len(target)
+        count += len(target)
+        last = batch.real(batch.terminal)
+        with context.autocast():
+            at_last = context.network.at(batch.real(batch.image)[last], batch.real(batch.step)[last])
+            q_at_last = at_last(batch.real(batch.action)[last].unsqueeze(1)).squeeze(1)
+        scores.append(q_at_last.float().cpu().numpy())
+        rewards.append(batch.real(batch.reward)[last].cpu().numpy())
+    if count == 0:
+        return None
+    q, reward = np.concatenate(scores).astype(np.float64), np.concatenate(rewards)
+    rows, error = calibration(q, reward)
+    return Validation(
+        transitions=count,
+        last_steps=len(q),
+        loss=total / count,
+        loss_last_step=_cross_entropy(q, reward),
+        roc_auc_last_step=roc_auc(q, reward > 0.5),
+        calibration_error=error,
+        calibration=rows,
+    )
+
+
+def roc_auc(score: Floats, positive: npt.NDArray[np.bool_]) -> float | None:
+    """Return the area under the ROC curve: the chance that a positive scores higher than a negative, ties counting ½.
+
+        AUC = (Σ ranks of the positives - p (p + 1) / 2) / (p n)
+
+    Args:
+        score: float [n].
+        positive: bool [n].
+
+    Returns:
+        A number in [0, 1], or None without both a positive and a negative.
+    """
+    positives, negatives = int(positive.sum()), int((~positive).sum())
+    if positives == 0 or negatives == 0:
+        return None
+    _, place, counts = np.unique(score, return_inverse=True, return_counts=True)
+    last_rank = np.cumsum(counts)
+    rank = (last_rank - (counts - 1) / 2)[place]
+    return float((rank[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def calibration(q: Floats, outcome: Floats) -> tuple[list[dict[str, float | int | None]], float | None]:
+    """Return the table of 10 equal bins of Q, and the expected calibration error.
+
+        ECE = Σ_b n_b / n |mean Q in b - rate of success in b|
+
+    Args:
+        q: float [n]; values outside [0, 1] count as 0 or 1.
+        outcome: float [n], 0 or 1.
+
+    Returns:
+        The rows, see `Validation.calibration`, and the error; None for n = 0.
+    """
+    q = np.clip(q, 0, 1)
+    bins = np.minimum((q * BINS).astype(np.int64), BINS - 1)
+    rows: list[dict[str, float | int | None]] = []
+    error = 0.0
+    for index in range(BINS):
+        inside = bins == index
+        count = int(inside.sum())
+        mean_q = float(q[inside].mean()) if count else None
+        rate = float(outcome[inside].mean()) if count else None
+        if mean_q is not None and rate is not None:
+            error += count / len(q) * abs(mean_q - rate)
+        bounds = {"low": index / BINS, "high": (index + 1) / BINS}
+        rows.append({**bounds, "count": count, "mean_q": mean_q, "success_rate": rate})
+    return rows, error if len(q) else None
+
+
+def _cross_entropy(q: Floats, outcome: Floats) -> float | None:
+    if len(q) == 0:
+        return None
+    q = np.clip(q, SURE, 1 - SURE)
+    return float(-np.mean(outcome * np.log(q) + (1 - outcome) * np.log(1 - q)))
