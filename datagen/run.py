@@ -49,11 +49,11 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     folder, task = settings.folder(), task_settings(settings.task)
     _refuse_other_folder(folder)
     existing = Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else None
+    _check_space(settings, folder, existing)
     objects = _object_set(settings, folder, existing)
     fresh = describe(settings, task, objects)
     if existing is not None:
         _require_same(folder, existing, fresh)
-    _check_space(settings, folder, existing)
     plan = plan_shards(settings.collection(), settings.size)
     missing = missing_shards(plan, existing or fresh)
     if existing is not None and not missing and existing.files:
@@ -147,7 +147,7 @@ def _require_same(folder: Path, existing: Manifest, fresh: Manifest) -> None:
 
 def _check_space(settings: DatagenSettings, folder: Path, existing: Manifest | None) -> None:
     """Refuse a disk too full for the missing grasps before anything is written."""
-    place = next(parent for parent in (folder, *folder.resolve().parents) if parent.exists())
+    place = next(parent for parent in (folder, *folder.resolve().parents) if parent.is_dir())
     check_disk(place, max(0, settings.size - (existing.episodes if existing is not None else 0)))
 
 

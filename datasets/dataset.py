@@ -73,6 +73,7 @@ class ShardPool:
         image_shape: (H, W, C).
         action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
         discount: γ of the stored `mc_return`.
+        object_set: `name` and `sha256` of the object set of the first dataset.
         manifest_digest: that of the manifest where the pool is one whole dataset, else that of the shards' digests.
     """
 
@@ -81,6 +82,7 @@ class ShardPool:
     image_shape: tuple[int, int, int]
     action_limits: tuple[float, float, float, float]
     discount: float
+    object_set: dict[str, Any]
     manifest_digest: str
     _footers: dict[Path, Any] = field(default_factory=dict, repr=False)
 
@@ -215,6 +217,7 @@ def _pool(found: list[tuple[Dataset, ShardEntry]], named: str, verify: bool) -> 
         image_shape=manifest.image_shape,
         action_limits=manifest.action_limits,
         discount=manifest.discount,
+        object_set=manifest.object_set,
         manifest_digest=manifest.digest() if whole else hashlib.sha256(digests.encode()).hexdigest(),
         _footers=footers,
     )

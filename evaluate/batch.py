@@ -79,20 +79,16 @@ class Result:
 
 
 def make_plan(jobs: Sequence[Job], settings: EvalSettings) -> list[Entry]:
-    """Find what each job needs; jobs without a run look at the object sets of those with one.
+    """Find what each job needs; jobs without a run take their scenes from those with one.
 
     Raises:
         UserError: the only job cannot be run.
     """
     entries: dict[Job, Entry] = {}
     for job in sorted(jobs, key=lambda job: job.run is None):
-        others = {
-            entry.prepared.objects.folder: None
-            for entry in entries.values()
-            if entry.prepared is not None and entry.prepared.task.name == (job.task or "regular")
-        }
+        beside = [entry.prepared for entry in entries.values() if entry.prepared is not None]
         try:
-            entries[job] = Entry(job, prepare(job, settings, others), None)
+            entries[job] = Entry(job, prepare(job, settings, beside), None)
         except UserError as error:
             if len(jobs) == 1:
                 raise

@@ -6,7 +6,7 @@ The scenes follow from the job; `eval.json` holds no times and no hosts, so the 
 import contextlib
 import json
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,28 +66,23 @@ class Prepared:
     finished: Evaluation | None
 
 
-def prepare(job: Job, settings: EvalSettings, others: Iterable[Path] = ()) -> Prepared:
+def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -> Prepared:
     """Find everything that a job needs.
 
     Args:
         job: the job.
         settings: of the command.
-        others: folders of object sets that other jobs use.
+        beside: jobs of the same plan that are prepared already: a policy without a run meets the scenes of the first of
+            them that has the same task, its settings and object set, so that the two can be compared.
 
     Raises:
         UserError: PyBullet, the run, its checkpoint, the task, the object set, its split or the policy is not there.
     """
     _check_simulator()
-    from graspq.sim.task import TaskSettings, draw_objects, task_settings
+    from graspq.sim.task import draw_objects
 
     policy, facts = _policy(job, settings)
-    name = job.task or (str(facts.task["name"]) if facts is not None else "regular")
-    if facts is not None and facts.task["name"] == name:
-        task = TaskSettings.from_json(facts.task)
-        objects = find_object_set(name, job.objects, facts.object_set, facts.datasets, others)
-    else:
-        task = task_settings(name)
-        objects = find_object_set(name, job.objects, None, (), others)
+    task, objects = _scenes(job, facts, beside)
     _check_fit(job, facts, task)
     draw_objects(task, objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
     identity = {
@@ -101,7 +96,7 @@ def prepare(job: Job, settings: EvalSettings, others: Iterable[Path] = ()) -> Pr
         "network": facts.network_sha256 if facts is not None else None,
         **(policy.identity() if policy is not None else {}),
     }
-    folder, finished = _place(job, name, settings.out, identity)
+    folder, finished = _place(job, task.name, settings.out, identity)
     return Prepared(job, task, objects, facts, policy, identity, folder, finished)
 
 
@@ -121,6 +116,19 @@ def _policy(job: Job, settings: EvalSettings) -> "tuple[Policy | None, RunFacts 
     if job.policy == ORACLE:
         return None, None
     return RandomObservationPolicy() if job.policy == RANDOM else UserPolicy.load(job.policy), None
+
+
+def _scenes(job: Job, facts: "RunFacts | None", beside: Sequence[Prepared]) -> "tuple[TaskSettings, ObjectSet]":
+    """Return the task and the object set that a job's scenes are made of."""
+    from graspq.sim.task import TaskSettings, task_settings
+
+    name = job.task or (str(facts.task["name"]) if facts is not None else "regular")
+    if facts is not None and facts.task["name"] == name:
+        objects = find_object_set(name, job.objects, facts.object_set, facts.datasets)
+        return TaskSettings.from_json(facts.task), objects
+    same = [other for other in beside if other.facts is not None and other.task.name == name]
+    task = same[0].task if same and facts is None else task_settings(name)
+    return task, find_object_set(name, job.objects, None, (), [other.objects.folder for other in same])
 
 
 def _check_fit(job: Job, facts: "RunFacts | None", task: "TaskSettings") -> None:

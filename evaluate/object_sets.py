@@ -39,7 +39,7 @@ def find_object_set(
     for folder in present:
         if wanted is None or sha256_of(folder / SET_FILE) == wanted:
             return _verified(folder)
-    make = f"make it with: grasp-objects make {DEFAULT_FOLDER / task}"
+    make = f"make it with: grasp-objects make {'procedural' if task == 'regular' else task} {DEFAULT_FOLDER / task}"
     if present:
         raise UserError(
             f"{present[0]}: not the object set of the run's data ({wanted}); name one with --objects FOLDER"

@@ -11,18 +11,34 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.evaluate.policies import ORACLE, RANDOM
-from graspq.evaluate.records import EVAL_FILE, EpisodeRow, Evaluation, find_evaluations
+from graspq.evaluate.records import EVAL_FILE, EpisodeRow, Evaluation, find_evaluations, identity_digest
 from graspq.evaluate.statistics import PairedDifference, paired_difference, wilson_interval
 from graspq.train.run import Run
 
 RUN_FILE = "config.json"
 REFERENCES = (RANDOM, ORACLE)
+
+
+class Scenes(NamedTuple):
+    """What must agree for two success rates to stand side by side.
+
+    Attributes:
+        task: name of the task.
+        split: split of the object set.
+        objects: SHA-256 of the object set.
+        settings: SHA-256 of the task's settings.
+    """
+
+    task: str
+    split: str
+    objects: str
+    settings: str
 
 
 @dataclass(frozen=True)
@@ -115,9 +131,8 @@ class Score:
         return found
 
     def outcomes(self) -> dict[tuple[Any, ...], bool]:
-        """Return success by scene; scores of the same panel share object set and split."""
-        task = json.dumps(self.evaluations[0].summary["job"].get("task"), sort_keys=True)
-        return {(task, row.seed, row.episode, row.object_ids): row.success for row in self.rows}
+        """Return success by scene; scores of a panel share task, split and object set."""
+        return {(row.seed, row.episode, row.object_ids): row.success for row in self.rows}
 
 
 @dataclass(frozen=True)
@@ -126,12 +141,12 @@ class Findings:
 
     Attributes:
         runs: training runs, in the order they were found.
-        panels: (task, split) and object set → scores, the references at the ends.
+        panels: scenes → scores on them, the references at the ends.
         evaluations: every evaluation that a score uses.
     """
 
     runs: list[RunData]
-    panels: dict[tuple[str, str, str], list[Score]]
+    panels: dict[Scenes, list[Score]]
 
     @property
     def evaluations(self) -> list[Evaluation]:
@@ -170,9 +185,10 @@ def gather(folders: Sequence[Path], baselines: Path | None) -> Findings:
     return Findings(runs, _panels(list(evaluations.values()), {run.folder: run.name for run in runs}))
 
 
-def _scenes(evaluation: Evaluation) -> tuple[str, str, str]:
+def _scenes(evaluation: Evaluation) -> Scenes:
     summary = evaluation.summary
-    return summary["task"], summary["split"], summary.get("object_set", {}).get("sha256", "")
+    settings = identity_digest(summary["job"].get("task", {}))
+    return Scenes(summary["task"], summary["split"], summary.get("object_set", {}).get("sha256", ""), settings)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -194,9 +210,9 @@ def _read_run(folder: Path, name: str) -> RunData:
     return RunData(folder, name, run.config, run.metrics())
 
 
-def _panels(evaluations: Sequence[Evaluation], names: dict[Path, str]) -> dict[tuple[str, str, str], list[Score]]:
+def _panels(evaluations: Sequence[Evaluation], names: dict[Path, str]) -> dict[Scenes, list[Score]]:
     """Group evaluations by scenes, and within by policy; of two with the same seed the longer one counts."""
-    grouped: dict[tuple[str, str, str], dict[tuple[str, str], dict[int, Evaluation]]] = defaultdict(dict)
+    grouped: dict[Scenes, dict[tuple[str, str], dict[int, Evaluation]]] = defaultdict(dict)
     for one in evaluations:
         summary = one.summary
         settings = {**summary["job"], "seed": None, "episodes": None}

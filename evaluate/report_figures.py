@@ -42,7 +42,7 @@ def calibration_charts(findings: Findings, colors: dict[str, int]) -> list[LineC
     """Return the charts of calibration: on held-back data, and on each panel's own grasps."""
     held_back = [_calibration_series(run.name, colors[run.name], _validation_bins(run)) for run in findings.runs]
     charts = [_calibration_chart("Held-back data", "estimated Q of the logged last action", held_back)]
-    for (task, split, _), scores in findings.panels.items():
+    for (task, split, *_), scores in findings.panels.items():
         candidates = [score for score in scores if not score.is_reference]
         series = [_calibration_series(one.name, colors[one.name], calibration_of(one.rows)) for one in candidates]
         charts.append(_calibration_chart(f"Own grasps, {task} {split}", "Q of the chosen last action", series))
@@ -77,7 +77,7 @@ def _calibration_chart(title: str, x_label: str, series: Sequence[Series]) -> Li
 def film_groups(findings: Findings) -> list[dict[str, Any]]:
     """Return the film strips, grouped by policy; those of candidates stand open."""
     groups = []
-    for (task, split, _), scores in findings.panels.items():
+    for (task, split, *_), scores in findings.panels.items():
         for score in sorted(scores, key=lambda score: (score.is_reference, -score.rate)):
             films = read_films(score.evaluations[0])
             if films:

@@ -12,7 +12,7 @@ from graspq.common.errors import UserError
 from graspq.common.options import flag
 from graspq.evaluate.policies import ORACLE, RANDOM
 from graspq.evaluate.records import Evaluation
-from graspq.evaluate.report_data import Findings, RunData, Score, comparisons
+from graspq.evaluate.report_data import Findings, RunData, Scenes, Score, comparisons
 from graspq.evaluate.statistics import mean_over_seeds
 
 REFERENCE_COLORS = {RANDOM: 8, ORACLE: 9}
@@ -34,17 +34,14 @@ def set_name(summary: dict[str, Any]) -> str:
     return str(summary.get("object_set", {}).get("name", "unknown"))
 
 
-def panel_of(
-    key: tuple[str, str, str], scores: Sequence[Score], runs: Sequence[RunData], colors: dict[str, int]
-) -> dict[str, Any]:
+def panel_of(key: Scenes, scores: Sequence[Score], runs: Sequence[RunData], colors: dict[str, int]) -> dict[str, Any]:
     """Return a panel of success: bars, differences, means over training seeds."""
-    task, split, digest = key
     counts = sorted({score.episodes for score in scores})
     episodes = f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,} to {counts[-1]:,}"
     name = set_name(scores[0].evaluations[0].summary)
     return {
-        "title": f"{task.capitalize()} task, {split} split",
-        "subtitle": f"{episodes} episodes a policy, object set {name} {digest[:8]}",
+        "title": f"{key.task.capitalize()} task, {key.split} split",
+        "subtitle": f"{episodes} episodes a policy, object set {name} {key.objects[:8]}, settings {key.settings[:8]}",
         "bars": [_bar(score, colors) for score in scores],
         "comparisons": [
             {

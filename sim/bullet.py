@@ -1,17 +1,17 @@
-"""Imports PyBullet without the line about its build that it prints on standard output."""
+"""Imports PyBullet without the line about its build that it prints on every import."""
 
 import os
-import sys
 
-sys.stdout.flush()
-_stdout = os.dup(1)
-_null = os.open(os.devnull, os.O_WRONLY)
-os.dup2(_null, 1)
+_NULL = os.open(os.devnull, os.O_WRONLY)
+_SAVED = {stream: os.dup(stream) for stream in (1, 2)}
+for _stream in _SAVED:
+    os.dup2(_NULL, _stream)
 try:
     import pybullet as bullet
 finally:
-    os.dup2(_stdout, 1)
-    os.close(_stdout)
-    os.close(_null)
+    for _stream, _copy in _SAVED.items():
+        os.dup2(_copy, _stream)
+        os.close(_copy)
+    os.close(_NULL)
 
 __all__ = ["bullet"]

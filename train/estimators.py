@@ -1,6 +1,12 @@
 """The paper's unified view as data: an estimator is a row that says what Q(s, a) is regressed onto, and how.
 
 A new estimator is one more row, or one row and a file with its own update. Dimensions: B batch, T steps.
+
+Differs, for all rows with default options (`--preset paper` undoes it all):
+1. The loss is the cross-entropy of Q in [0, 1] rather than the squared error of an unbounded Q.
+2. Batches of 256 rather than 32, shifted and mirrored images, weight decay, a learning rate that falls to 0.
+3. Policies use a moving average of the weights.
+4. The network is `DefaultNetwork`.
 """
 
 import dataclasses
@@ -72,7 +78,11 @@ class Estimator:
 
 
 def monte_carlo_target(batch: Batch, context: Context) -> Tensor:
-    """Return the observed return; see `targets.episode_value`."""
+    """Return the observed return; see `targets.episode_value`.
+
+    Source: Quillen et al. 2018, section "Regression with Monte Carlo Return Estimates".
+    Differs: 1. No discount, as the paper's footnote and its code have it; its formula has one.
+    """
     return episode_value(batch.mc_return)
 
 
@@ -80,6 +90,10 @@ def double_q_target(batch: Batch, context: Context) -> Tensor:
     """Return r + γ Q_θ'(s', a*) with a* the best for Q_θ of uniformly drawn actions; see `targets.bootstrapped`.
 
     One trunk pass of each network on s', whatever the number of candidates.
+
+    Source: Quillen et al. 2018, section "Off-Policy Q-Learning": 16 uniform candidates, a copy every 50 updates.
+    Differs: 1. The lagged network runs with the running statistics of batch normalisation that it was copied with; the
+    paper's network has none.
     """
     if batch.next_image is None or batch.next_step is None:
         raise ValueError("a bootstrapped target needs next_image and next_step in the batch")

@@ -96,6 +96,7 @@ def _configuration(
             "task": pool.task,
             "action_limits": list(pool.action_limits),
             "discount": pool.discount,
+            "object_set": pool.object_set,
             "episodes": pool.episodes,
             "training": {"blocks": len(training.blocks), "episodes": training.episodes, "rows": training.rows},
             "held_back": {"blocks": len(held_back.blocks), "episodes": held_back.episodes, "rows": held_back.rows},

@@ -104,7 +104,7 @@ def test_a_finished_dataset_is_left_alone(finished, objects):
 def test_nonsense_is_one_line_and_status_two_and_writes_nothing(tmp_path, arguments, message):
     done = run("--out", tmp_path / "never", *arguments, expect=2)
     assert message in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert not (tmp_path / "never").exists()
 
 

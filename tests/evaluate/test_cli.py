@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -68,6 +69,27 @@ def test_several_jobs_give_one_table_in_two_formats(workplace: SimpleNamespace) 
 def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -> None:
     ours, theirs = (Evaluation.load(workplace.out / f"{name}-regular-test-seed0-2").rows() for name in ("mc", "random"))
     assert [row.object_ids for row in ours] == [row.object_ids for row in theirs]
+
+
+def test_policies_without_a_run_meet_the_scenes_of_the_run_beside_them(
+    workplace: SimpleNamespace, run_folder: Path, tmp_path: Path
+) -> None:
+    from graspq.evaluate.batch import make_plan
+    from graspq.evaluate.jobs import jobs_from_settings
+
+    other = tmp_path / "run"
+    shutil.copytree(run_folder, other)
+    config = json.loads((other / "config.json").read_text())
+    config["dataset"]["task"]["finger_force"] = 17.0
+    (other / "config.json").write_text(json.dumps(config))
+    run, random, oracle = make_plan(
+        jobs_from_settings(replace(workplace.settings, runs=(str(other),), policy=("random", "oracle"))),
+        workplace.settings,
+    )
+    assert run.prepared is not None and random.prepared is not None and oracle.prepared is not None
+    assert run.prepared.task.finger_force == 17.0
+    assert run.prepared.task == random.prepared.task == oracle.prepared.task
+    assert random.status == "to do"
 
 
 def test_finished_jobs_are_not_run_again_and_nothing_changes(

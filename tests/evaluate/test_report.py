@@ -142,13 +142,15 @@ def test_names_from_users_are_escaped(tmp_path: Path) -> None:
     assert "<script>" not in page and "&lt;script&gt;" in page
 
 
-def test_baselines_of_other_scenes_are_left_out(tmp_path: Path, scored: Path) -> None:
-    folder = scored / "baselines" / "other"
-    evaluation = make_evaluation(folder, "random", np.array([True]), policy="random")
-    summary = {name: value for name, value in evaluation.summary.items() if name != "files"}
-    write_summary(folder, {**summary, "split": "train"})
-    findings = gather([scored / "runs"], scored / "baselines")
-    assert [key[:2] for key in findings.panels] == [("regular", "test")]
+def test_baselines_of_other_scenes_are_left_out(scored: Path) -> None:
+    for name, change in (("split", {"split": "train"}), ("settings", {"job": {"task": {"finger_force": 1.0}}})):
+        folder = scored / "baselines" / name
+        evaluation = make_evaluation(folder, "random", np.array([True]), policy="random")
+        summary = {key: value for key, value in evaluation.summary.items() if key != "files"}
+        write_summary(folder, {**summary, **change})
+    ((scenes, scores),) = gather([scored / "runs"], scored / "baselines").panels.items()
+    assert scenes[:2] == ("regular", "test")
+    assert [score.name for score in scores] == ["random", "dql", "mc", "oracle"]
 
 
 def test_seeds_are_pooled_and_of_one_seed_the_longest_evaluation_counts(tmp_path: Path) -> None:
