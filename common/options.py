@@ -200,6 +200,8 @@ def _parameter(field: Any, hint: Any) -> Callable[..., Any]:
     elif several:
         arguments["default"] = ()
     if inner is bool:
+        # Said outright: click makes of a switch without a default, and not given, False.
+        arguments.setdefault("default", None)
         return click.option(f"{flag(field.name)}/--no-{flag(field.name)[2:]}", field.name, **arguments)
     metavar = field.metadata["metavar"]
     return click.option(flag(field.name), field.name, type=kind, metavar=metavar, **arguments)

@@ -1,12 +1,15 @@
 """The rules of the house, read from the source: imports, packaging, names that others own."""
 
 import ast
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from graspq.train.estimators import as_markdown
 
 ROOT = Path(__file__).resolve().parent.parent
 # What each folder may import (DESIGN, section 1).
@@ -88,6 +91,19 @@ def test_every_package_is_listed_and_every_command_answers_help_and_version():
             done = subprocess.run(command, capture_output=True, text=True, timeout=60)
             assert done.returncode == 0, done.stderr
             assert expected in done.stdout
+
+
+def test_the_readmes_table_of_estimators_is_the_code():
+    readme = (ROOT / "README.md").read_text()
+    start = readme.index("\n", readme.index("<!-- estimators:")) + 1
+    assert readme[start : readme.index("<!-- end of estimators -->")] == as_markdown()
+
+
+def test_files_that_the_readme_names_exist():
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text())
+    missing = [link for link in links if "://" not in link and not (ROOT / link).exists()]
+    assert len(links) > 5
+    assert missing == []
 
 
 def test_tests_mirror_the_folders():

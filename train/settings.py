@@ -78,7 +78,7 @@ class TrainSettings(Settings):
     network: Literal["default", "conv", "paper"] = _preset_setting(
         "network", help="Q-network; conv is the default one without attention."
     )
-    loss: LossName = _preset_setting("loss", help="Loss between Q and target.")
+    loss: LossName = _preset_setting("loss", help="Loss between Q and target.")  # noqa: RUF009
     batch_size: int = _preset_setting("batch_size", help="Transitions of a gradient step.", minimum=2)
     learning_rate: float = _preset_setting("learning_rate", help="Highest learning rate of AdamW.", minimum=0)
     weight_decay: float = _preset_setting(

@@ -1,4 +1,5 @@
 import pytest
+
 from graspq.common.errors import UserError
 from graspq.common.files import (
     committed,

@@ -4,6 +4,7 @@ from typing import Literal
 
 import click
 import pytest
+
 from graspq.common.errors import UserError
 from graspq.common.options import Command, Group, Settings, options_from, parse_count, setting, with_version
 

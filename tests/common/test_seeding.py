@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from graspq.common.seeding import generator, integer_seed
 
 
@@ -21,4 +22,4 @@ def test_seed_zero_is_a_seed_and_negative_ones_are_refused():
 def test_integer_seeds_fit_in_63_bits():
     seeds = [integer_seed("a", key) for key in range(1000)]
     assert len(set(seeds)) == 1000
-    assert 0 <= min(seeds) and max(seeds) < 2**63
+    assert min(seeds) >= 0 and max(seeds) < 2**63

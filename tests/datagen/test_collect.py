@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from graspq.datagen.collect import collect_block
 from graspq.datagen.settings import CollectionSettings
 from graspq.sim.episode import GraspSimulation

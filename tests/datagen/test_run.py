@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from graspq.common.files import sha256_of
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.verify import verify

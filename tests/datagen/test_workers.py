@@ -1,4 +1,5 @@
 import pytest
+
 from graspq.common.errors import UserError
 from graspq.datagen.settings import CollectionSettings
 from graspq.datagen.workers import BlockJob, collect_blocks

@@ -1,11 +1,12 @@
 import warnings
 
 import gymnasium
-import graspq  # noqa: F401  (registers the environments)
 import numpy as np
 import pytest
-from graspq.common.errors import UserError
 from gymnasium.utils.env_checker import check_env
+
+import graspq  # noqa: F401  (registers the environments)
+from graspq.common.errors import UserError
 
 NAMES = {"regular": "graspq/RegularGrasping-v0", "targeted": "graspq/TargetedGrasping-v0"}
 

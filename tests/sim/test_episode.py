@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from graspq.sim.episode import GraspSimulation
 from graspq.sim.policies import RandomPolicy
 from graspq.sim.task import TASKS, draw_objects

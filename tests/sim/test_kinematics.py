@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from graspq.sim import kinematics, robot_model
 from graspq.sim.bullet import bullet
 

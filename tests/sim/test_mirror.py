@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
+
 from graspq.objects.third_party import import_meshes
 from graspq.sim.episode import GraspSimulation
 from graspq.sim.task import TASKS
-from scipy.spatial.transform import Rotation
 
 MIRROR = np.array([1.0, -1.0, 1.0, -1.0])
 PLACES = [(0.60, 0.05, 0.4), (0.47, -0.06, -0.9), (0.52, 0.09, 1.3)]

@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from graspq.sim.episode import GraspSimulation
 from graspq.sim.oracle import Oracle
 from graspq.sim.task import TASKS, draw_objects

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from graspq.common.errors import UserError
 from graspq.sim.policies import RandomPolicy
 
@@ -16,5 +17,5 @@ def test_actions_are_uniform_but_for_the_descent():
 
 
 def test_a_probability_beyond_one_is_refused():
-    with pytest.raises(UserError, match="at least 0 and at most 1, got 1.5"):
+    with pytest.raises(UserError, match=r"at least 0 and at most 1, got 1\.5"):
         RandomPolicy(1.5)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
+
 from graspq.sim import robot_model
 
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from graspq.common.errors import UserError
 from graspq.sim.task import TASKS, TaskSettings, draw_objects, rewarded_object, task_settings
 

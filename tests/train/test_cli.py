@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from graspq.train.cli import main
+from graspq.train.run import Run
 
 SHORT = ["--steps", "3", "--batch-size", "16", "--network", "conv", "--precision", "float32", "--threads", "1"]
 
@@ -35,6 +36,25 @@ def test_a_run_goes_to_its_default_folder_and_ends_with_one_line(dataset: Path, 
     assert done.stdout.startswith("runs/mc-two-states-seed0; step 3, loss 0.")
     assert done.stdout.count("\n") == 1 and "held-back loss" in done.stdout and "ROC AUC" in done.stdout
     assert (grasp_train.folder / "runs/mc-two-states-seed0/config.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "mirror", "batch_size"),
+    [
+        ([], True, 256),
+        (["--no-mirror"], False, 256),
+        (["--preset", "paper"], False, 32),
+        (["--preset", "paper", "--mirror", "--batch-size", "64"], True, 64),
+    ],
+)
+def test_the_preset_decides_what_the_command_line_leaves_out(
+    dataset: Path, grasp_train: Command, options: list[str], mirror: bool, batch_size: int
+) -> None:
+    common = ["--network", "conv", "--steps", "1", "--precision", "float32", "--threads", "1", "--out", "run"]
+    done = grasp_train("--algo", "mc", "--shards", str(dataset), *common, *options)
+    assert done.returncode == 0, done.stderr
+    settings = Run.open(grasp_train.folder / "run").config["settings"]
+    assert (settings["mirror"], settings["batch_size"]) == (mirror, batch_size)
 
 
 @pytest.mark.parametrize(
