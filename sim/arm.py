@@ -28,7 +28,6 @@ class Arm:
         self.task = task
         self.client = world.client
         self.world = world
-        # Without URDF_ENABLE_SLEEPING the arm never sleeps; it is always under control.
         self.body = world.load_urdf(robot_model.panda_urdf(), fixed=True)
         self.number = self.body.number
         self.fingers = robot_model.FINGER_LINKS
@@ -48,7 +47,10 @@ class Arm:
         return np.array([self.task.bin_center_x, 0.0, self.task.home_height, 0.0])
 
     def place(self, pose: Sequence[float] | np.ndarray) -> None:
-        """Put the arm at a pose at once, at rest, the gripper open."""
+        """Put the arm at a pose at once, at rest, awake, the gripper open."""
+        self.body.change_dynamics(
+            activationState=bullet.ACTIVATION_STATE_WAKE_UP | bullet.ACTIVATION_STATE_DISABLE_SLEEPING
+        )
         self.commanded = np.array(pose, dtype=float)
         self._joints = kinematics.joint_angles(*self.commanded)
         for joint, angle in zip(robot_model.ARM_JOINTS, self._joints, strict=True):
@@ -59,8 +61,11 @@ class Arm:
         self.grip(open_gripper=True)
 
     def park(self) -> None:
-        """Put the arm where no falling object can meet it."""
+        """Put the arm where no falling object can meet it, asleep until `place`: a sleeping arm costs no time."""
         self.place(_PARKED)
+        self.body.change_dynamics(
+            activationState=bullet.ACTIVATION_STATE_SLEEP | bullet.ACTIVATION_STATE_ENABLE_SLEEPING
+        )
 
     def grip(self, *, open_gripper: bool) -> None:
         """Command the fingers; they move while simulation steps pass."""

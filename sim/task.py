@@ -73,7 +73,7 @@ class TaskSettings(Settings):
     object_friction: float = 0.8
     rolling_friction: float = 0.001
     time_step: float = 1 / 240
-    solver_iterations: int = 30
+    solver_iterations: int = 20
     steps_per_action: int = 20
     settle_steps: int = 480
 

@@ -57,11 +57,18 @@ class World:
         for _ in range(count):
             bullet.stepSimulation(physicsClientId=self.client)
 
-    def load_urdf(self, path: Path, *, fixed: bool = False, flags: int = 0, position: Vector = (0, 0, 0)) -> "Body":
-        """Load a URDF with the inertia its file states."""
+    def load_urdf(
+        self, path: Path, *, fixed: bool = False, rigid: bool = False, flags: int = 0, position: Vector = (0, 0, 0)
+    ) -> "Body":
+        """Load a URDF with the inertia its file states; `rigid` makes a single link a plain, cheaper rigid body."""
         flags |= bullet.URDF_USE_INERTIA_FROM_FILE | bullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
         number = bullet.loadURDF(
-            str(path), basePosition=position, useFixedBase=fixed, flags=flags, physicsClientId=self.client
+            str(path),
+            basePosition=position,
+            useMaximalCoordinates=rigid,
+            useFixedBase=fixed,
+            flags=flags,
+            physicsClientId=self.client,
         )
         return Body(self, number)
 
@@ -73,7 +80,9 @@ class World:
         visual = bullet.createVisualShape(
             bullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=color, physicsClientId=self.client
         )
-        number = bullet.createMultiBody(0, shape, visual, position, physicsClientId=self.client)
+        number = bullet.createMultiBody(
+            0, shape, visual, position, useMaximalCoordinates=True, physicsClientId=self.client
+        )
         return Body(self, number)
 
     def close(self) -> None:
