@@ -68,7 +68,7 @@ class TaskSettings(Settings):
     drop_half_width: float = 0.1
     success_height: float = 0.12
     lift_height: float = 0.21
-    finger_force: float = 20.0
+    finger_force: float = 12.0
     finger_friction: float = 1.2
     object_friction: float = 0.8
     rolling_friction: float = 0.001
