@@ -4,8 +4,6 @@ Run again after any interruption it does what is missing; the bytes that result 
 or on how often it was interrupted. They depend on the settings and the versions in the manifest.
 """
 
-import math
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from tqdm import tqdm
 
 from graspq.common.errors import UserError
 from graspq.common.files import TEMPORARY_PREFIX, writable_folder
+from graspq.common.machine import available_cores
 from graspq.common.provenance import versions
 from graspq.datagen.plan import (
     BYTES_PER_GRASP,
@@ -61,7 +60,7 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
         return existing
     draw_check(task, objects, settings)
     writable_folder(folder, "dataset")
-    workers = settings.workers if settings.workers is not None else _cores()
+    workers = settings.workers if settings.workers is not None else available_cores()
     _announce(settings, folder, missing, workers)
     remove_leftovers(folder)
     objects.copy_to(folder / "objects")
@@ -154,7 +153,7 @@ def _check_space(settings: DatagenSettings, folder: Path, existing: Manifest | N
 def _announce(settings: DatagenSettings, folder: Path, missing: list[ShardPlan], workers: int) -> None:
     grasps = sum(shard.episodes for shard in missing)
     expected = grasps * BYTES_PER_GRASP
-    seconds = grasps / (GRASPS_PER_SECOND_AND_CORE * min(workers, _cores()))
+    seconds = grasps / (GRASPS_PER_SECOND_AND_CORE * min(workers, available_cores()))
     click.echo(
         f"{grasps:,} {settings.task} grasps to collect into {folder} with {workers} worker{'s' * (workers > 1)}: "
         f"about {human_bytes(expected)} and {human_time(seconds)} "
@@ -188,9 +187,3 @@ def _collect(
                 entry = write_shard(folder, manifest, shard.first_block, len(shard.jobs), ordered)
                 manifest = commit_shard(folder, manifest, entry)
     return manifest
-
-
-def _cores() -> int:
-    """Return the number of cores this process may use, at least 1."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return max(1, math.floor(available or 1))

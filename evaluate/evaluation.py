@@ -86,6 +86,7 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
     _check_fit(job, facts, task)
     draw_objects(task, objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
     identity = {
+        "simulator": versions("pybullet", "numpy"),
         "task": task.to_json(),
         "split": job.split,
         "seed": job.seed,

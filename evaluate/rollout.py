@@ -4,7 +4,6 @@ Episode i runs in slot i mod `environments`, its scene and its noise are functio
 made on a full batch with that slot's row: so no result depends on the number of workers or on what else runs.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
@@ -14,6 +13,7 @@ import click
 import numpy as np
 
 from graspq.common.errors import UserError
+from graspq.common.machine import available_cores
 from graspq.common.seeding import generator
 from graspq.evaluate.films import FilmKeeper
 from graspq.evaluate.policies import Policy
@@ -26,11 +26,6 @@ ATTEMPTS = 2
 
 class RolloutError(click.ClickException):
     """An episode that ends its simulator process each time it runs: a defect, reported in one line."""
-
-
-def available_cores() -> int:
-    """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """The two tasks as data: what lies in the bin, how the gripper may move, what counts as success.
 
-A task's settings hold everything that determines an episode; a dataset's manifest stores them, so that an evaluation
-rebuilds the same cell.
+A task's settings and `SIMULATOR_VERSION`, which stands for all that is written in the code of this folder, determine an
+episode; a dataset's manifest stores them, so that an evaluation rebuilds the same cell.
 """
 
 import dataclasses
@@ -14,6 +14,8 @@ from graspq.common.errors import UserError
 from graspq.common.options import Settings
 from graspq.objects.object_set import ObjectSet
 
+# Raised by hand with every change of this folder that can change a pixel or a pose.
+SIMULATOR_VERSION = 1
 EPISODES_PER_BIN = 20  # the paper switches the objects every 20 episodes
 
 
@@ -48,6 +50,7 @@ class TaskSettings(Settings):
         solver_iterations: of the constraint solver, a step.
         steps_per_action: simulation steps an action takes.
         settle_steps: most simulation steps objects get to come to rest.
+        simulator_version: of the code; settings of another version cannot be simulated.
     """
 
     name: Literal["regular", "targeted"] = "regular"
@@ -76,6 +79,7 @@ class TaskSettings(Settings):
     solver_iterations: int = 20
     steps_per_action: int = 20
     settle_steps: int = 480
+    simulator_version: int = SIMULATOR_VERSION
 
     @property
     def action_limits(self) -> tuple[float, float, float, float]:

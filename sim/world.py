@@ -3,6 +3,8 @@
 Several worlds live side by side in one process; no call can reach another world's client by mistake.
 """
 
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -10,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from graspq.common.errors import UserError
 from graspq.sim.bullet import bullet
 
 Vector = Sequence[float] | np.ndarray
@@ -28,9 +31,13 @@ class World:
 
         Raises:
             RuntimeError: PyBullet was built without NumPy, or the window cannot be opened.
+            UserError: a window was asked for and there is no display.
         """
         if not bullet.isNumpyEnabled():
             raise RuntimeError("this PyBullet was built without NumPy: images would come back as tuples; reinstall it")
+        if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            # PyBullet ends the whole process where it finds no display.
+            raise UserError("PyBullet's window needs a display (DISPLAY is not set); use render_mode='rgb_array'")
         self.client = bullet.connect(bullet.GUI if gui else bullet.DIRECT)
         if self.client < 0:
             raise RuntimeError("PyBullet could not open its window; is there a display?")

@@ -1,10 +1,8 @@
-"""The default network: a small residual trunk, and a head in which each candidate action looks at a place of the image.
+"""The default network: a small residual trunk, and an action that enters late and linearly.
 
-An action's outcome is decided where the gripper will land, so the head lets the action attend to the trunk's map there
-instead of squeezing the scene through one vector. Dimensions: B batch, N candidates, A action, P positions of the map.
+Whatever depends on the image alone is computed once for a state; sixteen candidate actions cost little more than one.
+Dimensions: B batch, N candidates, A action, H W C image.
 """
-
-import math
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +12,6 @@ from graspq.common.errors import UserError
 from graspq.train.networks import Features, NetworkSpecification, QNetwork
 
 CHANNELS = 64
-HEADS = 4
 STATE = 256
 HIDDEN = 128
 STEM = 16
@@ -40,24 +37,18 @@ class _Residual(nn.Module):
 class DefaultNetwork(QNetwork):
     """Residual trunk at 32, 16 and 8 pixels (for 64×64 images) and an action that enters late, linearly.
 
-    The trunk gives a vector z of the whole state and a map M with a row mₚ for each of P = 16·16 positions. With
-    attention, an action a reads the map through 4 heads: its query is linear in a and in z, and is compared with mₚ
-    and with fixed functions f of the position p (x, y, x², y², xy, sines and cosines), so that it can mean "near here":
+    The trunk gives a vector z of the whole state, and
 
-        q(a)  = W_q a + U_q z                                  4 heads of 64 + 17 numbers
-        c(a)  = Σₚ softmaxₚ(⟨q(a), (mₚ, f(p))⟩ / 8) mₚ          4 heads of 64 numbers
-        Q(s, a) = MLP(relu(U z + W a + O c(a)))
+        Q(s, a) = MLP(relu(U z + W a))
 
-    Keys and values are the map itself: a query that is linear in the action makes a further key layer needless, and the
-    trunk's cost does not grow. Batch normalisation uses running statistics in evaluation mode, which every pass but the
-    regression's own uses.
+    Batch normalisation uses running statistics in evaluation mode, which every pass but the regression's own uses.
+    A head in which each candidate attended to the trunk's map was tried: on 10,000 grasps its held-back loss was higher
+    at equal steps (0.512 against 0.508 after 800), and it cost more.
 
     Source: none; the paper's network is `PaperNetwork`.
     """
 
-    positions: Tensor
-
-    def __init__(self, specification: NetworkSpecification, *, attention: bool = True) -> None:
+    def __init__(self, specification: NetworkSpecification) -> None:
         super().__init__()
         height, width, channels = specification.image_shape
         if height % 8 or width % 8 or min(height, width) < 16:
@@ -75,17 +66,9 @@ class DefaultNetwork(QNetwork):
         self.action_to_hidden = nn.Linear(specification.actions, STATE, bias=False)
         self.hidden = nn.Linear(STATE, HIDDEN)
         self.last = nn.Linear(HIDDEN, 1)
-        self.attention = attention
-        if attention:
-            positions = _position_features(height // 4, width // 4)
-            self.register_buffer("positions", positions, persistent=False)
-            query = HEADS * (CHANNELS + positions.shape[0])
-            self.state_to_query = nn.Linear(STATE, query)
-            self.action_to_query = nn.Linear(specification.actions, query, bias=False)
-            self.attended_to_hidden = nn.Linear(HEADS * CHANNELS, STATE, bias=False)
 
     def trunk(self, image: Tensor, step: Tensor) -> Features:
-        """Return U z + bias [B, 256] and, with attention, U_q z + bias [B, 324] and the map M [B, P, 64]."""
+        """Return U z + bias [B, 256]; see `QNetwork.trunk`."""
         # Exact in bfloat16 too: whole numbers below 2⁸, then a power of two.
         x = image.permute(0, 3, 1, 2).to(_computing_type(image.device.type)).sub_(128).mul_(1 / 64)
         x = functional.relu(self.stem(x), inplace=True)
@@ -95,38 +78,16 @@ class DefaultNetwork(QNetwork):
         flat = functional.relu(self.squeeze(coarse), inplace=True).flatten(1)
         known_step = step.clamp(0, self.step.num_embeddings - 1)
         z = functional.relu(self.state(flat) + self.step(known_step))
-        if not self.attention:
-            return (self.state_to_hidden(z),)
-        return self.state_to_hidden(z), self.state_to_query(z), fine.flatten(2).transpose(1, 2)
+        return (self.state_to_hidden(z),)
 
     def head(self, features: Features, action: Tensor) -> Tensor:
         """Return raw outputs [B, N]; see `QNetwork.head`."""
         hidden = features[0].unsqueeze(1) + self.action_to_hidden(action)
-        if self.attention:
-            query = features[1].unsqueeze(1) + self.action_to_query(action)
-            attended = self._attend(query.view(len(query), query.shape[1] * HEADS, -1), features[2])
-            hidden = hidden + self.attended_to_hidden(attended.view(*action.shape[:2], -1))
         hidden = functional.relu(self.hidden(functional.relu(hidden)))
         # The last sum in float32: Q must tell candidates apart more finely than bfloat16's 8 bits.
         output: Tensor = (hidden.float() * self.last.weight[0]).sum(-1) + self.last.bias
         return output
 
-    def _attend(self, query: Tensor, values: Tensor) -> Tensor:
-        """Return Σₚ softmaxₚ(score) mₚ, [B, N·heads, 64], for queries [B, N·heads, 64 + 17] and the map [B, P, 64]."""
-        content, place = query[..., :CHANNELS], query[..., CHANNELS:]
-        scores = torch.bmm(content, values.transpose(1, 2)) + place @ self.positions
-        weights = (scores.float() / math.sqrt(CHANNELS)).softmax(-1)
-        return torch.bmm(weights.to(values.dtype), values)
-
 
 def _computing_type(device: str) -> torch.dtype:
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else torch.float32
-
-
-def _position_features(height: int, width: int) -> Tensor:
-    """Return x, y, x², y², xy and sines and cosines of each position of a map, x and y in [-1, 1]; float32 [17, P]."""
-    rows = (torch.arange(height) + 0.5) / height * 2 - 1
-    columns = (torch.arange(width) + 0.5) / width * 2 - 1
-    y, x = (grid.flatten() for grid in torch.meshgrid(rows, columns, indexing="ij"))
-    waves = [wave(math.pi * k * c) for k in (1, 2, 4) for c in (x, y) for wave in (torch.sin, torch.cos)]
-    return torch.stack([x, y, x * x, y * y, x * y, *waves])

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 PrecisionName = Literal["float32", "bfloat16"]
 PROBE_BATCH = 64
-TOLERANCE = 0.05
+# Correct bfloat16 gives about 0.1, an unrelated output 1.4.
+TOLERANCE = 0.3
 
 
 def chosen_device(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
@@ -40,6 +41,7 @@ def prepare(settings: "TrainSettings") -> None:
     """Set the number of threads, and keep freed memory in the process instead of giving it back after every step."""
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
+    torch.backends.cudnn.deterministic = True
     keep_freed_memory()
 
 
@@ -98,14 +100,14 @@ def chosen_precision(
             outputs[candidate.name], seconds[candidate.name] = _trial(trial, candidate, image_shape, batch)
         if seconds["bfloat16"] > 10 * seconds["float32"]:
             break
-    difference = float((outputs["bfloat16"] - outputs["float32"]).abs().max())
-    scale = max(1.0, float(outputs["float32"].abs().max()))
-    right = difference <= TOLERANCE * scale  # false for NaN too
+    difference = float((outputs["bfloat16"] - outputs["float32"]).square().mean().sqrt())
+    # Against how much Q differs between states: at the start Q itself is near 0, and any noise would be small beside 1.
+    right = difference <= TOLERANCE * float(outputs["float32"].std())  # false for NaN too
     faster = seconds["bfloat16"] < seconds["float32"]
     probe = {
         "asked": "auto",
         "milliseconds": {key: round(1e3 * value, 2) for key, value in seconds.items()},
-        "largest_difference": difference if right else repr(difference),
+        "root_mean_square_difference": difference if right else repr(difference),
         "batch": batch,
     }
     return Precision("bfloat16" if right and faster else "float32", device, probe)

@@ -1,7 +1,8 @@
 """The training loop: batches in the sampler's order, one update each, validation, metrics and checkpoints.
 
 Every step is a function of the settings, the step and the state before it, so that a run that was stopped at any moment
-and started again ends in the same weights.
+and started again ends in the same weights: bit for bit on a CPU with the same number of threads, and as far as the
+driver's kernels are deterministic on a GPU.
 """
 
 import dataclasses
@@ -197,6 +198,7 @@ class _Session:
         if saves or step % settings.log_every == 0:
             self._log(progress)
         if finished or step % settings.validate_every == 0:
+            self._check_weights()
             result = self.validate()
             if result is not None:
                 progress.log_validation(step, result)
@@ -224,11 +226,14 @@ class _Session:
             batches = transition_batches(pool, size, self.estimator.needs_next)
             yield from (to_tensors(batch, self.precision.device) for batch in batches)
 
-    def _save(self) -> None:
+    def _check_weights(self) -> None:
         for name, network in self.state.networks.items():
             for part, tensor in network.state_dict().items():
                 if not bool(torch.isfinite(tensor).all()):
                     self._diverged(self.state.step, f"{part} of the {name} network")
+
+    def _save(self) -> None:
+        self._check_weights()
         save_checkpoint(self.run.checkpoints_folder, self.state, self.specification)
         self.run.prune(self.settings.keep_checkpoints)
         self.saved_step = self.state.step

@@ -124,20 +124,13 @@ def _paper(specification: NetworkSpecification) -> QNetwork:
     return PaperNetwork(specification)
 
 
-def _attention(specification: NetworkSpecification) -> QNetwork:
+def _default(specification: NetworkSpecification) -> QNetwork:
     from graspq.train.default_network import DefaultNetwork
 
     return DefaultNetwork(specification)
 
 
-def _convolutional(specification: NetworkSpecification) -> QNetwork:
-    from graspq.train.default_network import DefaultNetwork
-
-    return DefaultNetwork(specification, attention=False)
-
-
 NETWORKS: dict[str, Callable[[NetworkSpecification], QNetwork]] = {
-    "default": _attention,
-    "conv": _convolutional,
+    "default": _default,
     "paper": _paper,
 }

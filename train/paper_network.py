@@ -92,5 +92,6 @@ class PaperNetwork(QNetwork):
         summed = self.first.weight.view(CHANNELS, CHANNELS + 1, -1).sum(2)
         hidden = self.first_norm(features[0].unsqueeze(1) + functional.linear(embedding, summed))
         hidden = self.second_norm(self.second(hidden))
-        output: Tensor = self.last(hidden)
-        return output.squeeze(-1).float()
+        # The last sum in float32: Q must tell candidates apart more finely than bfloat16's 8 bits.
+        output: Tensor = (hidden.float() * self.last.weight[0]).sum(-1) + self.last.bias
+        return output

@@ -19,7 +19,7 @@ PresetName = Literal["default", "paper"]
 
 PRESETS: dict[PresetName, dict[str, Any]] = {
     "default": {
-        "steps": 8_000,
+        "steps": 5_000,
         "network": "default",
         "loss": "cross-entropy",
         "batch_size": 256,
@@ -31,6 +31,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "shift": 4,
         "mirror": True,
         "jitter": 0.0,
+        "precision": "auto",
     },
     # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
     "paper": {
@@ -46,6 +47,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "shift": 0,
         "mirror": False,
         "jitter": 0.0,
+        "precision": "float32",
     },
 }
 
@@ -75,9 +77,7 @@ class TrainSettings(Settings):
     seed: int = setting(0, help="Seed of weights, sample order, augmentation and candidates.", minimum=0)
     preset: PresetName = setting("default", help="Values of all options marked with two values in brackets.")
     steps: int = _preset_setting("steps", help="Gradient steps, such as 8000 or 8k.", minimum=1, parse=parse_count)
-    network: Literal["default", "conv", "paper"] = _preset_setting(
-        "network", help="Q-network; conv is the default one without attention."
-    )
+    network: Literal["default", "paper"] = _preset_setting("network", help="Q-network.")
     loss: LossName = _preset_setting("loss", help="Loss between Q and target.")  # noqa: RUF009
     batch_size: int = _preset_setting("batch_size", help="Transitions of a gradient step.", minimum=2)
     learning_rate: float = _preset_setting("learning_rate", help="Highest learning rate of AdamW.", minimum=0)
@@ -120,8 +120,8 @@ class TrainSettings(Settings):
         minimum=1,
     )
     device: Literal["auto", "cpu", "cuda"] = setting("auto", help="Where to train; auto takes a GPU if there is one.")
-    precision: Literal["auto", "float32", "bfloat16"] = setting(
-        "auto", help="Arithmetic of the networks; auto tries both at the start and takes the faster right one."
+    precision: Literal["auto", "float32", "bfloat16"] = _preset_setting(
+        "precision", help="Arithmetic of the networks; auto tries both at the start and takes the faster right one."
     )
     threads: int | None = setting(None, help="CPU threads of torch; its own choice where not given.", minimum=1)
 

@@ -82,7 +82,10 @@ class Context:
 
 
 def seeded(purpose: str, *keys: int) -> torch.Generator:
-    """Return a CPU generator that depends on purpose and keys alone; see `common.seeding`."""
+    """Return a CPU generator that depends on purpose and keys alone; see `common.seeding`.
+
+    Torch uses 32 bits of the seed: among millions of steps a few streams coincide, by chance.
+    """
     return torch.Generator().manual_seed(integer_seed(purpose, *keys))
 
 

@@ -58,10 +58,13 @@ def test_objects_are_switched_every_twenty_episodes(folders):
     environment.close()
 
 
-def test_rendering_gives_a_larger_picture_and_bad_arguments_one_line(folders):
+def test_rendering_gives_a_larger_picture_and_bad_arguments_one_line(folders, monkeypatch):
     environment = gymnasium.make(NAMES["targeted"], objects=folders["targeted"], render_mode="rgb_array")
     environment.reset(seed=0)
     assert environment.render().shape == (256, 256, 3)
     environment.close()
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(UserError, match="needs a display"):
+        gymnasium.make(NAMES["regular"], objects=folders["regular"], render_mode="human")
     with pytest.raises(UserError, match="the regular task has train, test"):
         gymnasium.make(NAMES["regular"], objects=folders["regular"], split="validation")

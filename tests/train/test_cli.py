@@ -8,7 +8,7 @@ import pytest
 from graspq.train.cli import main
 from graspq.train.run import Run
 
-SHORT = ["--steps", "3", "--batch-size", "16", "--network", "conv", "--precision", "float32", "--threads", "1"]
+SHORT = ["--steps", "3", "--batch-size", "16", "--network", "default", "--precision", "float32", "--threads", "1"]
 
 
 class Command:
@@ -50,7 +50,7 @@ def test_a_run_goes_to_its_default_folder_and_ends_with_one_line(dataset: Path, 
 def test_the_preset_decides_what_the_command_line_leaves_out(
     dataset: Path, grasp_train: Command, options: list[str], mirror: bool, batch_size: int
 ) -> None:
-    common = ["--network", "conv", "--steps", "1", "--precision", "float32", "--threads", "1", "--out", "run"]
+    common = ["--network", "default", "--steps", "1", "--precision", "float32", "--threads", "1", "--out", "run"]
     done = grasp_train("--algo", "mc", "--shards", str(dataset), *common, *options)
     assert done.returncode == 0, done.stderr
     settings = Run.open(grasp_train.folder / "run").config["settings"]

@@ -11,7 +11,7 @@ from graspq.train.hardware import chosen_device, chosen_precision, keep_freed_me
 from graspq.train.networks import NetworkSpecification, make_network
 from graspq.train.state import seeded
 
-SPECIFICATION = NetworkSpecification("conv", (16, 16, 3), 4, 15, "logistic")
+SPECIFICATION = NetworkSpecification("default", (16, 16, 3), 4, 15, "logistic")
 
 
 def test_a_precision_that_was_asked_for_is_taken_and_its_autocast_does_what_it_says() -> None:

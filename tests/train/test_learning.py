@@ -25,7 +25,7 @@ def test_the_estimator_reaches_its_own_values_and_cem_acts_on_them(
 ) -> None:
     chosen = settings(
         algo,
-        network="conv",
+        network="default",
         steps=200,
         batch_size=64,
         lag_steps=20,

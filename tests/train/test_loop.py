@@ -145,7 +145,7 @@ def test_a_discount_that_the_returns_were_not_made_with_is_refused_for_mc(settin
 
 def test_divergence_stops_with_estimator_step_quantity_and_the_last_good_checkpoint(settings: Make) -> None:
     with pytest.raises(DivergedError) as error:
-        train(settings("mc", preset="paper", network="conv", steps=40, learning_rate=1e30, checkpoint_every=1))
+        train(settings("mc", preset="paper", network="default", steps=40, learning_rate=1e30, checkpoint_every=1))
     message = str(error.value)
     assert message.startswith("mc diverged at step ") and "is not finite" in message and "\n" not in message
 

@@ -8,7 +8,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from graspq.common.errors import UserError
-from graspq.train.default_network import DefaultNetwork
 from graspq.train.networks import NETWORKS, NetworkSpecification, QNetwork, make_network
 from graspq.train.paper_network import PaperNetwork
 from graspq.train.state import seeded
@@ -125,18 +124,6 @@ def test_evaluation_passes_leave_batch_statistics_alone_and_do_not_use_the_batch
         assert torch.equal(buffer, before[name]), name
 
 
-def test_attention_can_tell_apart_places_that_look_alike() -> None:
-    network = make_network(specification("default"), seeded("tests/weights"))
-    assert isinstance(network, DefaultNetwork)
-    # A query without content that asks for large x: the map's right half is marked.
-    values = torch.zeros(1, 256, 64)
-    values.view(1, 16, 16, 64)[:, :, 8:] = 1.0
-    place = torch.zeros(1, 4, 81)
-    place[..., 64] = 100.0
-    attended = network._attend(place, values)
-    torch.testing.assert_close(attended, torch.ones(1, 4, 64), rtol=0, atol=1e-3)
-
-
 def test_q_is_a_probability_with_the_logistic_link_and_the_raw_output_without() -> None:
     image, step, action = states()
     for link in ("logistic", "identity"):
@@ -163,5 +150,5 @@ def test_images_that_a_network_cannot_take_are_refused_in_one_line(name: str, si
 
 
 def test_an_unknown_network_is_refused_with_the_choices() -> None:
-    with pytest.raises(UserError, match="choose from default, conv, paper"):
+    with pytest.raises(UserError, match="choose from default, paper"):
         make_network(specification("resnet"))

@@ -9,7 +9,7 @@ from graspq.train.networks import NetworkSpecification
 from graspq.train.settings import TrainSettings
 from graspq.train.state import TrainState, advance, learning_rate, new_state
 
-SPECIFICATION = NetworkSpecification("conv", (16, 16, 3), 4, 15, "logistic")
+SPECIFICATION = NetworkSpecification("default", (16, 16, 3), 4, 15, "logistic")
 
 
 @pytest.fixture
