@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := sim,dev
 QUICK := runs/quickstart
-QUICK_STEPS := 600
+QUICK_STEPS := 700
 export PYTHONUNBUFFERED := 1
 
 .PHONY: help setup quickstart test lint types data clean

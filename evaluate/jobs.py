@@ -74,7 +74,7 @@ def read_jobs(path: Path, settings: EvalSettings) -> list[Job]:
 
     Its top level holds defaults for its `[[jobs]]` tables, or, without such tables, one of them. Keys: the lists `runs`
     (folders or globs), `policies`, `tasks`, `splits`, `objects` and `seeds`, and `episodes`, `checkpoint` and `cem`
-    (a table of iterations, samples, elites). What a file leaves out comes from the command line's options.
+    (a table of iterations, samples, elites, answer). What a file leaves out comes from the command line's options.
 
     Raises:
         UserError: the file cannot be read, or a key or a value in it is none of these.
@@ -110,8 +110,8 @@ def _check_keys(table: dict[str, Any], where: str) -> None:
             raise UserError(f"{where}: {key} = {value!r}; expected a whole number")
         if key == "seeds" and min(value) < 0:
             raise UserError(f"{where}: seeds = {value!r}; a seed is at least 0")
-        if key == "cem" and not (isinstance(value, dict) and all(type(item) is int for item in value.values())):
-            raise UserError(f"{where}: cem = {value!r}; expected a table of whole numbers")
+        if key == "cem" and not (isinstance(value, dict) and all(type(item) in (int, str) for item in value.values())):
+            raise UserError(f"{where}: cem = {value!r}; expected a table of the settings of CEM")
     if not table.get("runs") and not table.get("policies"):
         raise UserError(f"{where}: neither runs nor policies; name at least one")
 

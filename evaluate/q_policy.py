@@ -33,7 +33,12 @@ class QPolicy(Policy):
                 torch.from_numpy(np.ascontiguousarray(images)).to(self.device),
                 torch.from_numpy(np.asarray(steps, dtype=np.int64)).to(self.device),
             )
-            choice = cross_entropy_method(q_of_actions, torch.from_numpy(noise).to(self.device), elites=self.cem.elites)
+            choice = cross_entropy_method(
+                q_of_actions,
+                torch.from_numpy(noise).to(self.device),
+                elites=self.cem.elites,
+                answer=self.cem.answer,
+            )
             actions, q = choice.action.float().cpu().numpy(), choice.q.float().cpu().numpy()
         return Decision(np.clip(actions, -1, 1), q)
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 from graspq.common.errors import UserError
 from graspq.common.options import Settings, parse_count, setting
+from graspq.train.selection import Answer
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -22,7 +23,8 @@ class CemSettings(Settings):
 
     iterations: int = setting(3, help="Iterations of CEM.", minimum=1, maximum=100)
     samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
-    elites: int = setting(6, help="Best actions that the next iteration is fitted to.", minimum=2)
+    elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
+    answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
 
     def __post_init__(self) -> None:
         """Check the ranges, and that there are no more elites than samples.
@@ -56,6 +58,9 @@ class EvalSettings(Settings):
     cem_iterations: int = setting(CemSettings.iterations, help="Iterations of CEM.", minimum=1, maximum=100)
     cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
     cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
+    cem_answer: Answer = setting(
+        CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
+    )
     device: Device = setting("auto", help="Where the network runs.")
     out: Path | None = setting(
         None, help="Folder for the results and their table. Default: RUN/evaluations/, runs/baselines/ without a run."
@@ -71,4 +76,4 @@ class EvalSettings(Settings):
     @property
     def cem(self) -> CemSettings:
         """Return the settings of CEM."""
-        return CemSettings(self.cem_iterations, self.cem_samples, self.cem_elites)
+        return CemSettings(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_answer)

@@ -49,7 +49,7 @@ class Oracle:
         x, y, _, phi = simulation.arm.commanded
         goal = self._plan or Grasp(task.bin_center_x, 0.0, 0.0, 0.0, 0.0)
         limits = np.asarray(task.action_limits)
-        action = np.array([goal.x - x, goal.y - y, 0.0, goal.phi - phi]) / limits
+        action: np.ndarray = np.array([goal.x - x, goal.y - y, 0.0, goal.phi - phi]) / limits
         if np.abs(action).max() <= 1.0:
             action[2] = -1.0
         else:

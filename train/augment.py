@@ -23,11 +23,14 @@ class Augmentation:
         mirror: whether half of a batch is mirrored about the plane y = 0, in which the scene is symmetric: its columns
             are reversed and dy and dphi of its actions are negated.
         jitter: largest relative change of contrast, and of brightness in parts of the whole range of grey levels.
+        action_noise: standard deviation of normal noise on actions, in units of the action limits. A grasp forgives a
+            few millimetres: without the noise Q is jagged in the action, and a search finds its false peaks.
     """
 
     shift: int
     mirror: bool
     jitter: float
+    action_noise: float = 0.0
 
     def __call__(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the changed batch.
@@ -41,6 +44,7 @@ class Augmentation:
         mirrored = torch.rand(size, generator=generator) < (0.5 if self.mirror else 0.0)
         contrast = 1 + self.jitter * (2 * torch.rand(size, generator=generator) - 1)
         brightness = 255 * self.jitter * (2 * torch.rand(size, generator=generator) - 1)
+        noise = self.action_noise * torch.randn(batch.action.shape, generator=generator)
         device = batch.image.device
 
         def change(image: Tensor) -> Tensor:
@@ -52,7 +56,7 @@ class Augmentation:
             batch,
             image=change(batch.image),
             next_image=None if batch.next_image is None else change(batch.next_image),
-            action=mirrored_action(batch.action, mirrored.to(device)),
+            action=mirrored_action((batch.action + noise.to(device)).clamp(-1, 1), mirrored.to(device)),
             synthetic_action=mirrored_action(batch.synthetic_action, mirrored.to(device)),
         )
 

@@ -137,7 +137,7 @@ class _Session:
         settings, state = self.settings, self.state
         if state.step >= last:
             return
-        augmentation = Augmentation(settings.shift, settings.mirror, settings.jitter)
+        augmentation = Augmentation(settings.shift, settings.mirror, settings.jitter, settings.action_noise)
         loader = self._loader(pool)
         progress = Progress(self.run, settings, state.step, show_progress)
         with loader, progress, _Interruption() as interruption:

@@ -5,13 +5,17 @@ choice does not depend on which other states share its batch. Dimensions: B batc
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 QOfActions = Callable[[Tensor], Tensor]
 """Q of candidate actions, [B, N, A] -> [B, N], for B states that are fixed inside it."""
+Answer = Literal["mean", "best"]
+# Where the cross-entropy method starts: straight down, (dx, dy, dz, dphi).
+START_MEAN = (0.0, 0.0, -1.0, 0.0)
+START_DEVIATION = 0.5
 
 
 class Choice(NamedTuple):
@@ -55,45 +59,60 @@ def uniform_search(q_of_actions: QOfActions, candidates: Tensor) -> Choice:
     return _best(candidates, q_of_actions(candidates))
 
 
-def cross_entropy_method(q_of_actions: QOfActions, noise: Tensor, *, elites: int = 6) -> Choice:
-    """Return the best action that the cross-entropy method meets.
+def cross_entropy_method(
+    q_of_actions: QOfActions, noise: Tensor, *, elites: int = 10, answer: Answer = "mean"
+) -> Choice:
+    """Return the action that the cross-entropy method ends at.
 
-        first iteration:   aᵢ = 2 Φ(εᵢ) - 1, uniform on [-1, 1]ᴬ
+        first iteration:   aᵢ = clip(μ₀ + σ₀ εᵢ, -1, 1),  μ₀ = (0, 0, -1, 0), σ₀ = 0.5
         later iterations:  aᵢ = clip(μ + σ εᵢ, -1, 1),  μ, σ = mean and standard deviation (n - 1) of the elites
+        answer:            μ of the last iteration's elites ("mean"), or the best of all samples ("best")
 
     Args:
         q_of_actions: Q-function of candidates.
         noise: standard normal numbers, float [I, B, N, A]; its shape says how many iterations and samples there are.
             See `cem_noise`.
-        elites: how many of the N samples the next iteration's normal distribution is fitted to, 2 to N.
+        elites: how many of the N samples a normal distribution is fitted to, 2 to N.
+        answer: see above. Where Q is learned the mean is the better action: the best sample is often a false peak.
 
     Returns:
-        The best of all I·N samples of each state.
+        The action and its Q.
 
     Raises:
         ValueError: `noise` has not four dimensions or `elites` is not between 2 and N.
 
     Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning" (3 iterations, 64 samples).
-    Differs: the released code starts from a normal distribution around (0, 0, -1, 0) with deviation 0.5, keeps 10
-    elites, does not clip, and takes the best of the last iteration alone. Here the first iteration covers the whole
-    range of actions evenly, and no good sample is forgotten.
+    Start and number of elites are the released code's. Where the search starts matters: the data descend in nine of ten
+    actions, and a search that starts evenly finds actions that Q has hardly seen and overrates; a `dql` policy then
+    hovers until T (success 0.00 against 0.52 over the same scenes).
+    Differs: the released code does not clip, and takes the best of the last iteration; the answer is the mean here.
     """
     if noise.dim() != 4 or not 2 <= elites <= noise.shape[2]:
         raise ValueError(
             f"expected noise [iterations, batch, samples, action] and 2 to {noise.shape[-2]} elites, "
             f"got noise {list(noise.shape)} and {elites} elites"
         )
-    candidates = 2 * torch.special.ndtr(noise[0]) - 1
+    start = torch.tensor(START_MEAN, device=noise.device, dtype=noise.dtype)
+    candidates = (start + START_DEVIATION * noise[0]).clamp(-1, 1)
     q = q_of_actions(candidates)
     best = _best(candidates, q)
     for epsilon in noise[1:]:
-        chosen = q.topk(elites, dim=1).indices
-        elite = candidates.gather(1, chosen.unsqueeze(-1).expand(-1, -1, candidates.shape[-1]))
-        deviation, mean = torch.std_mean(elite, dim=1, keepdim=True)
+        deviation, mean = _elite_moments(candidates, q, elites)
         candidates = (mean + deviation * epsilon).clamp(-1, 1)
         q = q_of_actions(candidates)
         best = _better(best, _best(candidates, q))
-    return best
+    if answer == "best":
+        return best
+    _, mean = _elite_moments(candidates, q, elites)
+    return Choice(mean.squeeze(1), q_of_actions(mean).squeeze(1))
+
+
+def _elite_moments(candidates: Tensor, q: Tensor, elites: int) -> tuple[Tensor, Tensor]:
+    """Return standard deviation and mean, [B, 1, A] each, of the `elites` candidates of highest Q."""
+    chosen = q.topk(elites, dim=1).indices
+    elite = candidates.gather(1, chosen.unsqueeze(-1).expand(-1, -1, candidates.shape[-1]))
+    deviation, mean = torch.std_mean(elite, dim=1, keepdim=True)
+    return deviation, mean
 
 
 def _best(candidates: Tensor, q: Tensor) -> Choice:

@@ -19,7 +19,7 @@ PresetName = Literal["default", "paper"]
 
 PRESETS: dict[PresetName, dict[str, Any]] = {
     "default": {
-        "steps": 5_000,
+        "steps": 3_000,
         "network": "default",
         "loss": "cross-entropy",
         "batch_size": 256,
@@ -31,6 +31,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "shift": 4,
         "mirror": True,
         "jitter": 0.0,
+        "action_noise": 0.0,
         "precision": "auto",
     },
     # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
@@ -47,6 +48,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "shift": 0,
         "mirror": False,
         "jitter": 0.0,
+        "action_noise": 0.0,
         "precision": "float32",
     },
 }
@@ -100,6 +102,9 @@ class TrainSettings(Settings):
     mirror: bool = _preset_setting("mirror", help="Mirror half of each batch about the scene's plane of symmetry.")
     jitter: float = _preset_setting(
         "jitter", help="Largest random relative change of contrast and brightness.", minimum=0, maximum=1
+    )
+    action_noise: float = _preset_setting(
+        "action_noise", help="Standard deviation of noise on logged actions, in units of the limits.", minimum=0
     )
     discount: float | None = setting(
         None, help="Discount of bootstrapped targets, 0 to 1; 0.9 where it is not given.", minimum=0, maximum=1
