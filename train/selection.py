@@ -84,7 +84,7 @@ def cross_entropy_method(
     Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning" (3 iterations, 64 samples).
     Start and number of elites are the released code's. Where the search starts matters: the data descend in nine of ten
     actions, and a search that starts evenly finds actions that Q has hardly seen and overrates; a `dql` policy then
-    hovers until T (success 0.00 against 0.52 over the same scenes).
+    hovers until T (one measured run: success 0 of 300 against 52 of 100).
     Differs: the released code does not clip, and takes the best of the last iteration; the answer is the mean here.
     """
     if noise.dim() != 4 or not 2 <= elites <= noise.shape[2]:
