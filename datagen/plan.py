@@ -45,8 +45,8 @@ def missing_shards(plan: list[ShardPlan], manifest: Manifest) -> list[ShardPlan]
     return [shard for shard in plan if have.get(shard.first_block, 0) < shard.episodes]
 
 
-def check_disk(folder: Path, grasps: int) -> int:
-    """Return the bytes that collecting `grasps` more will take.
+def check_disk(folder: Path, grasps: int) -> None:
+    """Check that the disk has room for `grasps` more.
 
     Raises:
         UserError: the disk has less than that free, with a tenth and 64 MiB to spare.
@@ -58,7 +58,6 @@ def check_disk(folder: Path, grasps: int) -> int:
             f"{folder}: {grasps:,} grasps take about {human_bytes(expected)}, the disk has {human_bytes(free)} free; "
             "free some space, choose another folder or a smaller size"
         )
-    return expected
 
 
 def human_bytes(count: float) -> str:
