@@ -8,12 +8,12 @@ import dataclasses
 import multiprocessing
 import signal
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from graspq.common.errors import UserError
-from graspq.datagen.collect import collect_block
+from graspq.datagen.collect import CollectingPolicy, collect_block
 from graspq.datagen.settings import CollectionSettings
 from graspq.datasets.episode import Episode
 from graspq.objects.object_set import ObjectSet
@@ -23,13 +23,19 @@ from graspq.sim.task import TaskSettings
 BLOCKS_PER_WORKER = 500
 _DEATHS_ALLOWED = 1
 
+PolicyMaker = Callable[[], CollectingPolicy]
+
 
 @dataclasses.dataclass(frozen=True)
 class BlockJob:
-    """A block to collect: its number and how many of its episodes."""
+    """A block to collect: its number and how many of its episodes; see `collect_block`."""
 
     block: int
     episodes: int
+    first_episode: int | None = None
+
+
+_Setup = tuple[TaskSettings, Path, CollectionSettings, PolicyMaker | None]
 
 
 @dataclasses.dataclass
@@ -41,18 +47,34 @@ class _Worker:
 
 
 def collect_blocks(
-    jobs: Iterable[BlockJob], task: TaskSettings, objects: Path, settings: CollectionSettings, workers: int
+    jobs: Iterable[BlockJob],
+    task: TaskSettings,
+    objects: Path,
+    settings: CollectionSettings,
+    workers: int,
+    make_policy: PolicyMaker | None = None,
 ) -> Iterator[tuple[BlockJob, list[Episode]]]:
     """Collect blocks in `workers` processes and yield each as it is finished, in any order.
+
+    Args:
+        jobs: what to collect.
+        task: of the dataset.
+        objects: folder of its object set.
+        settings: of the dataset.
+        workers: number of processes; 0 collects in this one.
+        make_policy: makes who acts, in each worker: it travels there pickled; the random policy where not given.
 
     Raises:
         UserError: a block killed its worker twice.
         RuntimeError: a worker reported an error of ours; the message holds its traceback.
     """
+    if workers == 0:
+        yield from _collect_here(jobs, task, objects, settings, make_policy)
+        return
     waiting = deque(jobs)
     deaths: dict[int, int] = {}
     team: list[_Worker] = []
-    setup = (task, objects, settings)
+    setup = (task, objects, settings, make_policy)
     try:
         while waiting or any(worker.job is not None for worker in team):
             _employ(team, waiting, workers, setup)
@@ -69,11 +91,24 @@ def collect_blocks(
             _dismiss(worker)
 
 
+def _collect_here(
+    jobs: Iterable[BlockJob],
+    task: TaskSettings,
+    objects: Path,
+    settings: CollectionSettings,
+    make_policy: PolicyMaker | None,
+) -> Iterator[tuple[BlockJob, list[Episode]]]:
+    policy = make_policy() if make_policy is not None else None
+    with GraspSimulation(task, ObjectSet.load(objects)) as simulation:
+        for job in jobs:
+            yield job, collect_block(simulation, settings, job.block, job.episodes, policy, job.first_episode)
+
+
 def _employ(
     team: list[_Worker],
     waiting: deque[BlockJob],
     workers: int,
-    setup: tuple[TaskSettings, Path, CollectionSettings],
+    setup: _Setup,
 ) -> None:
     """Renew tired workers, fill the team, and give every idle worker a job."""
     for worker in [member for member in team if member.job is None and member.finished >= BLOCKS_PER_WORKER]:
@@ -87,7 +122,7 @@ def _employ(
             worker.connection.send(worker.job)
 
 
-def _hire(setup: tuple[TaskSettings, Path, CollectionSettings]) -> _Worker:
+def _hire(setup: _Setup) -> _Worker:
     # Spawned, not forked: a fork would copy threads' locks and the parent's physics clients.
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -133,16 +168,20 @@ def _dismiss(worker: _Worker) -> None:
     worker.process.join(timeout=10)
 
 
-def _work(connection: Connection, task: TaskSettings, objects: Path, settings: CollectionSettings) -> None:
+def _work(
+    connection: Connection,
+    task: TaskSettings,
+    objects: Path,
+    settings: CollectionSettings,
+    make_policy: PolicyMaker | None,
+) -> None:
     """Collect blocks until the other end of the pipe is closed; the parent alone answers Ctrl-C."""
     import traceback
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with GraspSimulation(task, ObjectSet.load(objects)) as simulation:
-            while True:
-                job = connection.recv()
-                connection.send(collect_block(simulation, settings, job.block, job.episodes))
+        for finished in _collect_here(iter(connection.recv, None), task, objects, settings, make_policy):
+            connection.send(finished[1])
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # the parent is gone or needs us no more
     except UserError as error:

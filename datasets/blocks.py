@@ -3,7 +3,8 @@
 Page checksums are verified on every read. Dimension key: N rows of the block, H W C image.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pyarrow.parquet as pq
 from graspq.common.errors import UserError
 from graspq.datasets.batch import RECORD, Bool, Int64, Records
 from graspq.datasets.episode import Float32, UInt8
+from graspq.datasets.labels import mc_return
 
 REMEDY = "`grasp-data verify` lists all faults; the command that made the dataset makes bad shards again"
 
@@ -88,6 +90,35 @@ def read_block(ref: BlockRef, image_shape: tuple[int, int, int], metadata: Any =
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
+
+
+def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> dict[str, Any]:
+    """Return some columns of a block as numpy arrays, [N] or [N, width], without reading the others.
+
+    Args:
+        ref: the block.
+        names: of columns of the steps table.
+        metadata: the file's footer where it was read before.
+
+    Raises:
+        UserError: the file is missing, truncated or damaged; the message names the file and the block.
+    """
+    try:
+        with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
+            table = file.read_row_group(ref.row_group, columns=list(names), use_threads=False)
+        return {name: _numpy(table.column(name)) for name in names}
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
+
+
+def relabelled(block: BlockArrays, discount: float) -> BlockArrays:
+    """Return the block with `mc_return` made anew from its rewards, with another discount γ in [0, 1]."""
+    records = block.records.copy()
+    for first, length in zip(block.first_rows.tolist(), block.lengths.tolist(), strict=True):
+        episode = slice(first, first + length)
+        records["mc_return"][episode] = mc_return(records["reward"][episode], discount)
+    return replace(block, records=records)
 
 
 def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, int]) -> BlockArrays:

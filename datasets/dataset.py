@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.datasets.blocks import REMEDY, BlockArrays, BlockRef, read_block
+from graspq.datasets.blocks import REMEDY, BlockArrays, BlockRef, read_block, read_columns, relabelled
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
 
 HASHING_THREADS = 4
@@ -72,7 +72,7 @@ class ShardPool:
         task: the task's settings as JSON.
         image_shape: (H, W, C).
         action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
-        discount: γ of the stored `mc_return`.
+        discount: γ of `mc_return`: the stored one, or that of `with_discount`.
         object_set: `name` and `sha256` of the object set of the first dataset.
         manifest_digest: that of the manifest where the pool is one whole dataset, else that of the shards' digests.
     """
@@ -85,6 +85,7 @@ class ShardPool:
     object_set: dict[str, Any]
     manifest_digest: str
     _footers: dict[Path, Any] = field(default_factory=dict, repr=False)
+    _relabels: bool = field(default=False, repr=False)
 
     @property
     def rows(self) -> int:
@@ -103,7 +104,16 @@ class ShardPool:
 
     def read_block(self, ref: BlockRef) -> BlockArrays:
         """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""
-        return read_block(ref, self.image_shape, self._footers.get(ref.path))
+        block = read_block(ref, self.image_shape, self._footers.get(ref.path))
+        return relabelled(block, self.discount) if self._relabels else block
+
+    def read_columns(self, ref: BlockRef, names: Sequence[str]) -> dict[str, Any]:
+        """Return some stored columns of a block; see `blocks.read_columns`."""
+        return read_columns(ref, names, self._footers.get(ref.path))
+
+    def with_discount(self, discount: float) -> "ShardPool":
+        """Return the pool with `mc_return` made from the rewards with γ in [0, 1], where that is not the stored one."""
+        return self if discount == self.discount else replace(self, discount=discount, _relabels=True)
 
     def split(self, validation_fraction: float, seed: int) -> tuple["ShardPool", "ShardPool"]:
         """Return (training, held back): a block is held back with probability `validation_fraction`.

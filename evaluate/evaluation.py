@@ -15,6 +15,7 @@ import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
+from graspq.common.options import flag
 from graspq.common.provenance import code_revision, versions
 from graspq.evaluate.films import write_films
 from graspq.evaluate.jobs import Job
@@ -252,5 +253,5 @@ def command_of(job: Job) -> str:
     usual = CemSettings()
     for name, value in job.cem.to_json().items():
         if value != getattr(usual, name):
-            words += [f"--cem-{name}", str(value)]
+            words += [flag(f"cem_{name}"), str(value)]
     return shlex.join(words)

@@ -4,10 +4,8 @@
 """
 
 import abc
-import importlib
 import inspect
 import os
-import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +15,7 @@ import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
+from graspq.common.named_objects import named_module
 from graspq.common.seeding import generator
 from graspq.evaluate.settings import CemSettings, Device
 
@@ -145,11 +144,8 @@ class UserPolicy(Policy):
         module_name, _, factory_name = name.partition(":")
         if not module_name or not factory_name:
             raise UserError(f"policy {name!r}: expected random, oracle, or module:factory of your own")
-        here = str(Path.cwd())
-        # At the end: what is installed keeps its names, whatever the working folder holds.
-        sys.path.append(here)
         try:
-            module = importlib.import_module(module_name)
+            module = named_module(module_name)
             factory = getattr(module, factory_name, None)
             if not callable(factory):
                 raise UserError(f"policy {name}: {module_name} has no function {factory_name!r}")
@@ -158,8 +154,6 @@ class UserPolicy(Policy):
             raise
         except Exception as error:
             raise UserError(f"policy {name}: cannot be made, {_described(error)}") from error
-        finally:
-            sys.path.remove(here)
         source = inspect.getsourcefile(module)
         return cls(name, wrapped, Path(source) if source is not None else None)
 

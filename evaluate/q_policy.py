@@ -1,4 +1,4 @@
-"""The policy of a trained Q-function: the cross-entropy method over actions, its trunk computed once for a state.
+"""The policies of a trained Q-function: the cross-entropy method over actions, its trunk computed once for a state.
 
 Dimension key: B batch rows, I iterations, N samples, A action, H W C image.
 """
@@ -11,7 +11,8 @@ import torch
 
 from graspq.evaluate.policies import ACTION_DIMENSIONS, Decision, Policy
 from graspq.evaluate.settings import CemSettings
-from graspq.train.selection import cross_entropy_method
+from graspq.train.selection import SearchSpace, cross_entropy_method, one_step_of
+from graspq.train.supervised import motions_at
 
 if TYPE_CHECKING:
     from graspq.train.networks import QNetwork
@@ -27,20 +28,26 @@ class QPolicy(Policy):
         self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
     ) -> Decision:
         """Search the best action of each state; see `Policy.decide`."""
-        noise = self._noise(generators)
+        noise = torch.from_numpy(self._noise(generators)).to(self.device)
+        step = torch.from_numpy(np.asarray(steps, dtype=np.int64)).to(self.device)
         with torch.inference_mode():
-            q_of_actions = self.network.at(
-                torch.from_numpy(np.ascontiguousarray(images)).to(self.device),
-                torch.from_numpy(np.asarray(steps, dtype=np.int64)).to(self.device),
-            )
             choice = cross_entropy_method(
-                q_of_actions,
-                torch.from_numpy(noise).to(self.device),
+                self.network.at(torch.from_numpy(np.ascontiguousarray(images)).to(self.device), step),
+                noise,
                 elites=self.cem.elites,
                 answer=self.cem.answer,
+                space=self._space(step),
             )
-            actions, q = choice.action.float().cpu().numpy(), choice.q.float().cpu().numpy()
-        return Decision(np.clip(actions, -1, 1), q)
+            action = self._executed(choice.action.float())
+        return Decision(np.clip(action.cpu().numpy(), -1, 1), choice.q.float().cpu().numpy())
+
+    def _space(self, step: torch.Tensor) -> SearchSpace | None:
+        """Return where to search at steps int64 [B]; None for a step's own actions."""
+        return None
+
+    def _executed(self, found: torch.Tensor) -> torch.Tensor:
+        """Return the actions, [B, A], for what the search found."""
+        return found
 
     def _noise(self, generators: Sequence[np.random.Generator | None]) -> np.ndarray:
         """Draw float32 [I, B, N, A], the same numbers for a state whatever batch it is in."""
@@ -54,3 +61,22 @@ class QPolicy(Policy):
     def identity(self) -> dict[str, Any]:
         """Return the search's settings."""
         return {"cem": self.cem.to_json()}
+
+
+class SyntheticPolicy(QPolicy):
+    """Searches the whole motion to the last pose, as `supervised` learns it, and takes its first step.
+
+    The motion lies in the range of the training data at that step; it is planned anew at every step.
+    """
+
+    def __init__(
+        self, network: "QNetwork", cem: CemSettings, device: torch.device, extra: dict[str, torch.Tensor]
+    ) -> None:
+        super().__init__(network, cem, device)
+        self.extra = {name: tensor.to(device) for name, tensor in extra.items()}
+
+    def _space(self, step: torch.Tensor) -> SearchSpace:
+        return motions_at(self.extra, step)
+
+    def _executed(self, found: torch.Tensor) -> torch.Tensor:
+        return one_step_of(found, self.cem.synthetic_step)

@@ -15,6 +15,7 @@ from graspq.evaluate.charts import PLOT
 from graspq.evaluate.policies import ORACLE, RANDOM
 from graspq.evaluate.report_data import Findings, RunData, Score, gather
 from graspq.evaluate.report_figures import calibration_charts, film_groups, learning_curves
+from graspq.evaluate.report_sweeps import stability_of
 from graspq.evaluate.report_tables import (
     command_lines,
     evaluation_row,
@@ -32,7 +33,7 @@ PALETTE = 8  # colours of candidates; the two after them are the references'
 def write_report(
     folders: Sequence[Path], out: Path, *, title: str | None = None, baselines: Path | None = None
 ) -> None:
-    """Write a report on the runs and evaluations in some folders, atomically.
+    """Write a report on the runs, evaluations and sweeps in some folders, atomically.
 
     Args:
         folders: see `report_data.gather`.
@@ -67,6 +68,7 @@ def render(findings: Findings, title: str | None = None) -> str:
         lead=_lead(first),
         cards=_cards(findings, first),
         panels=[panel_of(key, scores, findings.runs, colors) for key, scores in findings.panels.items()],
+        stability=[one for one in (stability_of(sweep, PALETTE) for sweep in findings.sweeps) if one is not None],
         curves=learning_curves(findings.runs, colors),
         calibration=calibration_charts(findings, colors),
         films=film_groups(findings),

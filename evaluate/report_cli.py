@@ -16,7 +16,7 @@ class ReportSettings(Settings):
     """Settings of `grasp-report`; see each field's help."""
 
     folders: tuple[Path, ...] = setting(
-        help="Runs, evaluations, or folders that hold some.", positional=True, metavar="FOLDER..."
+        help="Runs, evaluations, sweeps, or folders that hold some.", positional=True, metavar="FOLDER..."
     )
     out: Path = setting(Path("report.html"), help="The HTML file to write.")
     baselines: Path | None = setting(
@@ -32,13 +32,14 @@ class ReportSettings(Settings):
 def main(settings: ReportSettings) -> None:
     """Write one self-contained HTML page on runs and evaluations.
 
-    It shows success with intervals, learning curves, calibration, film strips and settings; it needs no network, and
-    can be mailed or put on a web server as it is.
+    It shows success with intervals, learning curves, calibration, film strips and settings, and of a sweep every run's
+    success, sorted; it needs no network, and can be mailed or put on a web server as it is.
 
     \b
     Examples:
       grasp-report runs/mc runs/dql --out report.html
       grasp-report runs/quickstart --out runs/quickstart/report.html
+      grasp-report runs/sweep-small --out sweep.html
     """
     from graspq.evaluate.report import write_report
 

@@ -8,7 +8,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ import numpy as np
 from graspq.common.errors import UserError
 from graspq.evaluate.policies import ORACLE, RANDOM
 from graspq.evaluate.records import EVAL_FILE, EpisodeRow, Evaluation, find_evaluations, identity_digest
+from graspq.evaluate.report_sweeps import Sweep, all_left_out, find_sweeps
 from graspq.evaluate.statistics import PairedDifference, paired_difference, wilson_interval
 from graspq.train.run import Run
 
@@ -142,11 +143,13 @@ class Findings:
     Attributes:
         runs: training runs, in the order they were found.
         panels: scenes → scores on them, the references at the ends.
+        sweeps: sweeps of many runs; of these runs, `runs` and `panels` hold the best of each estimator.
         evaluations: every evaluation that a score uses.
     """
 
     runs: list[RunData]
     panels: dict[Scenes, list[Score]]
+    sweeps: list[Sweep] = field(default_factory=list)
 
     @property
     def evaluations(self) -> list[Evaluation]:
@@ -158,7 +161,7 @@ def gather(folders: Sequence[Path], baselines: Path | None) -> Findings:
     """Find the runs and evaluations at and below some folders.
 
     Args:
-        folders: run folders, evaluations, or folders that hold some of them.
+        folders: run folders, evaluations, sweeps, or folders that hold some of them.
         baselines: where else to look for evaluations of the random policy, the oracle and users' policies: those of
             tasks and splits that appear already, or all if none does.
 
@@ -167,22 +170,29 @@ def gather(folders: Sequence[Path], baselines: Path | None) -> Findings:
     """
     paths: dict[Path, None] = {}
     evaluations: dict[Path, Evaluation] = {}
+    sweeps: dict[Path, Sweep] = {}
     for folder in folders:
         if not folder.is_dir():
             raise UserError(f"{folder}: no such folder; expected a run of grasp-train or an evaluation of grasp-eval")
         here = [path.parent for path in sorted(folder.rglob(RUN_FILE)) if _is_run(path.parent)]
         found = find_evaluations(folder)
-        if not here and not found:
+        swept = find_sweeps(folder)
+        if not here and not found and not swept:
             raise UserError(f"{folder}: neither a run of grasp-train ({RUN_FILE}) nor an evaluation ({EVAL_FILE}) here")
         paths.update({path.resolve(): None for path in here})
         evaluations.update({one.folder.resolve(): one for one in found})
+        sweeps.update({one.folder.resolve(): one for one in swept})
+    for left_out in all_left_out(list(sweeps.values())):
+        paths.pop(left_out, None)
+        evaluations = {path: one for path, one in evaluations.items() if left_out not in path.parents}
     if baselines is not None and baselines.is_dir():
         shown = {_scenes(one) for one in evaluations.values()}
         for one in find_evaluations(baselines):
             if not shown or _scenes(one) in shown:
                 evaluations.setdefault(one.folder.resolve(), one)
     runs = [_read_run(path, name) for path, name in zip(paths, _names(list(paths)), strict=True)]
-    return Findings(runs, _panels(list(evaluations.values()), {run.folder: run.name for run in runs}))
+    panels = _panels(list(evaluations.values()), {run.folder: run.name for run in runs})
+    return Findings(runs, panels, list(sweeps.values()))
 
 
 def _scenes(evaluation: Evaluation) -> Scenes:

@@ -6,15 +6,19 @@ This module alone knows how a run's `config.json` and its datasets say so.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from graspq.common.errors import UserError
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
-from graspq.evaluate.q_policy import QPolicy
+from graspq.evaluate.actor_policy import ActorPolicy
+from graspq.evaluate.policies import Policy
+from graspq.evaluate.q_policy import QPolicy, SyntheticPolicy
 from graspq.evaluate.settings import CemSettings, Device
-from graspq.train.checkpoint import STATE_FILE, load_policy_network
+from graspq.train.checkpoint import STATE_FILE, LoadedRun, load_acting
+from graspq.train.estimators import estimator_named
+from graspq.train.networks import QNetwork
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,8 @@ class RunFacts:
     steps: int
 
 
-def load_run(path: Path, checkpoint: int | None, cem: CemSettings, device: Device) -> tuple[QPolicy, RunFacts]:
-    """Load a run's network into a policy.
+def load_run(path: Path, checkpoint: int | None, cem: CemSettings, device: Device) -> tuple[Policy, RunFacts]:
+    """Load a run into a policy.
 
     Args:
         path: the run's folder.
@@ -58,24 +62,34 @@ def load_run(path: Path, checkpoint: int | None, cem: CemSettings, device: Devic
     """
     if (path / STATE_FILE).is_file():
         raise UserError(f"{path}: a checkpoint, expected its run; name {path.parent.parent} with --checkpoint STEP")
-    network, config = load_policy_network(path, checkpoint)
+    loaded = load_acting(path, checkpoint)
     try:
-        dataset, loaded, specification = config["dataset"], config["checkpoint"], config["network"]
-        folders = tuple(_datasets(config["settings"]["shards"]))
+        dataset, settings = loaded.config["dataset"], loaded.config["settings"]
+        folders = tuple(_datasets(settings["shards"]))
         facts = RunFacts(
-            algo=str(config["settings"]["algo"]),
-            step=int(loaded["step"]),
-            network_sha256=str(loaded["sha256"]),
+            algo=str(settings["algo"]),
+            step=loaded.step,
+            network_sha256=loaded.sha256,
             task=dict(dataset["task"]),
             datasets=folders,
             object_set=dataset.get("object_set", {}).get("sha256") or _object_set(folders),
-            image_shape=tuple(specification["image_shape"]),
+            image_shape=loaded.specification.image_shape,
             action_limits=tuple(dataset["action_limits"]),
-            steps=int(specification["steps"]),
+            steps=loaded.specification.steps,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path / 'config.json'}: not the configuration of a training run ({error!r})") from None
-    return QPolicy(network, cem, _chosen(device)), facts
+    return _policy(loaded, facts, cem, _chosen(device)), facts
+
+
+def _policy(loaded: LoadedRun, facts: RunFacts, cem: CemSettings, device: torch.device) -> Policy:
+    """Return the policy that the run's estimator asks for."""
+    acting = estimator_named(facts.algo).acting
+    if acting == "actor":
+        return ActorPolicy(loaded.networks, device)
+    if acting == "synthetic search":
+        return SyntheticPolicy(cast(QNetwork, loaded.networks["q"]), cem, device, loaded.extra)
+    return QPolicy(cast(QNetwork, loaded.networks["q"]), cem, device)
 
 
 def _chosen(device: Device) -> torch.device:

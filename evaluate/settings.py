@@ -9,9 +9,12 @@ from typing import Literal
 
 from graspq.common.errors import UserError
 from graspq.common.options import Settings, parse_count, setting
-from graspq.train.selection import Answer
+from graspq.train.selection import Answer, StepMode
 
 Device = Literal["auto", "cpu", "cuda"]
+SYNTHETIC_STEP_HELP = (
+    "How a motion of supervised becomes a step: scaled to the action limits, or each component clipped to them."
+)
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class CemSettings(Settings):
     samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
     elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
     answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
+    synthetic_step: StepMode = setting("scale", help=SYNTHETIC_STEP_HELP)
 
     def __post_init__(self) -> None:
         """Check the ranges, and that there are no more elites than samples.
@@ -61,6 +65,7 @@ class EvalSettings(Settings):
     cem_answer: Answer = setting(
         CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
     )
+    cem_synthetic_step: StepMode = setting(CemSettings.synthetic_step, help=SYNTHETIC_STEP_HELP)
     device: Device = setting("auto", help="Where the network runs.")
     out: Path | None = setting(
         None, help="Folder for the results and their table. Default: RUN/evaluations/, runs/baselines/ without a run."
@@ -76,4 +81,6 @@ class EvalSettings(Settings):
     @property
     def cem(self) -> CemSettings:
         """Return the settings of CEM."""
-        return CemSettings(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_answer)
+        return CemSettings(
+            self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_answer, self.cem_synthetic_step
+        )

@@ -21,6 +21,8 @@ MAY_IMPORT = {
     "datagen": {"sim", "objects", "datasets", "common"},
     "train": {"datasets", "common"},
     "evaluate": {"sim", "objects", "train", "datasets", "common"},
+    "online": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
+    "studies": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "common"},
 }
 
 

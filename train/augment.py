@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from graspq.train.batch import Batch
+from graspq.train.distributed import WHOLE, BatchPart
 
 # (dx, dy, dz, dphi): the mirror image of a motion across the plane y = 0 turns dy and dphi around.
 MIRRORED_ACTION = (1.0, -1.0, 1.0, -1.0)
@@ -32,19 +33,29 @@ class Augmentation:
     jitter: float
     action_noise: float = 0.0
 
-    def __call__(self, batch: Batch, generator: torch.Generator) -> Batch:
+    def __call__(self, batch: Batch, generator: torch.Generator, part: BatchPart = WHOLE) -> Batch:
         """Return the changed batch.
 
         Args:
             batch: what the loader gave.
-            generator: a CPU generator; how much is drawn depends on B alone.
+            generator: a CPU generator; how much is drawn depends on the rows of the whole batch alone.
+            part: which rows of it these are.
         """
-        size = len(batch.image)
-        shifts = torch.randint(-self.shift, self.shift + 1, (size, 2), generator=generator)
-        mirrored = torch.rand(size, generator=generator) < (0.5 if self.mirror else 0.0)
-        contrast = 1 + self.jitter * (2 * torch.rand(size, generator=generator) - 1)
-        brightness = 255 * self.jitter * (2 * torch.rand(size, generator=generator) - 1)
-        noise = self.action_noise * torch.randn(batch.action.shape, generator=generator)
+        size, steps, dimensions = batch.action.shape
+        low, high = -self.shift, self.shift + 1
+
+        def uniform() -> Tensor:
+            return part.draw(size, lambda rows: torch.rand(rows, generator=generator))
+
+        def normal() -> Tensor:
+            return part.draw(size, lambda rows: torch.randn(rows, dimensions, generator=generator))
+
+        shifts = part.draw(size, lambda rows: torch.randint(low, high, (rows, 2), generator=generator))
+        mirrored = uniform() < (0.5 if self.mirror else 0.0)
+        contrast = 1 + self.jitter * (2 * uniform() - 1)
+        brightness = 255 * self.jitter * (2 * uniform() - 1)
+        # Step by step, and last: episodes are padded to different lengths on different ranks.
+        noise = self.action_noise * torch.stack([normal() for _ in range(steps)], 1)
         device = batch.image.device
 
         def change(image: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
+from graspq.datasets.dataset import ShardPool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,7 +23,7 @@ class Batch:
         action: float32 [B, T, A], in units of the action limits.
         reward: float32 [B, T].
         terminal: bool [B, T].
-        mc_return: float32 [B, T], with the dataset's discount.
+        mc_return: float32 [B, T], with the run's discount.
         synthetic_action: float32 [B, T, A], in the units of `action`.
         next_image: uint8 [B, T, H, W, C], meaningless where terminal; None in episodes and where no target reads it.
         next_step: int64 [B, T]; None as `next_image`.
@@ -40,6 +41,11 @@ class Batch:
     next_step: Tensor | None = None
     mask: Tensor | None = None
 
+    @property
+    def real_steps(self) -> Tensor:
+        """Number of steps that are no padding, a scalar."""
+        return torch.tensor(self.step.numel(), device=self.step.device) if self.mask is None else self.mask.sum()
+
     def real(self, values: Tensor) -> Tensor:
         """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""
         flat = values.flatten(0, 1)
@@ -47,11 +53,16 @@ class Batch:
 
 
 def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> Batch:
-    """Move a loader's batch to `device`; on the CPU without copying."""
+    """Move a loader's batch to `device`: on the CPU without copying, to a GPU without waiting for the copy.
+
+    Episodes are cut to the longest one of the batch: few last as long as they may.
+    """
     transitions = isinstance(batch, TransitionBatch)
+    longest = 0 if isinstance(batch, TransitionBatch) else int(batch.mask.any(0).sum())
 
     def tensor(array: np.ndarray) -> Tensor:
-        moved = torch.from_numpy(array).to(device, non_blocking=True)
+        values = torch.from_numpy(array if transitions else array[:, :longest])
+        moved = (values.pin_memory() if device.type == "cuda" else values).to(device, non_blocking=True)
         return moved.unsqueeze(1) if transitions else moved
 
     names = ("image", "step", "action", "reward", "terminal", "mc_return", "synthetic_action")
@@ -61,3 +72,8 @@ def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> B
     if batch.next_image is None:
         return Batch(**common)
     return Batch(**common, next_image=tensor(batch.next_image), next_step=tensor(batch.next_step))
+
+
+def episodes_of_a_batch(pool: ShardPool, transitions: int) -> int:
+    """Return how many whole episodes of the pool have so many transitions on average; at least one, at most all."""
+    return max(1, min(round(transitions * pool.episodes / max(pool.rows, 1)), pool.episodes))

@@ -3,6 +3,7 @@
 A checkpoint is a folder `step-00000500` with one file for each network and optimiser, and `state.json`.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -17,11 +18,11 @@ from torch import Tensor, nn
 
 from graspq.common.errors import UserError
 from graspq.common.files import TEMPORARY_PREFIX, fsync_folder, read_json
-from graspq.train.networks import NetworkSpecification, QNetwork, make_network
+from graspq.train.networks import NetworkSpecification
 from graspq.train.run import Run, checkpoint_name, step_of
-from graspq.train.state import TrainState
+from graspq.train.state import Networks, TrainState, make_part
 
-FORMAT = 1
+FORMAT = 2
 STATE_FILE = "state.json"
 REMEDY = "copy it again, or delete this checkpoint's folder to go on from the one before it"
 
@@ -39,9 +40,19 @@ def save_checkpoint(folder: Path, state: TrainState, specification: NetworkSpeci
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     contents = {f"{name}.safetensors": network.state_dict() for name, network in state.networks.items()}
-    contents |= {f"{name}.safetensors": _moments(*pair) for name, pair in state.optimizers.items()}
+    contents |= {
+        f"optimizer-{part}.safetensors": _moments(optimizer, state.learned[part])
+        for part, optimizer in state.optimizers.items()
+    }
+    contents["extra.safetensors"] = state.extra
     files = {name: _write(temporary / name, _packed(tensors)) for name, tensors in contents.items()}
-    description = {"format": FORMAT, "step": state.step, "network": specification.to_json(), "files": files}
+    description = {
+        "format": FORMAT,
+        "step": state.step,
+        "network": specification.to_json(),
+        "parts": dict(state.parts),
+        "files": files,
+    }
     described = json.dumps(description | {"digest": _digest(description)}, indent=2) + "\n"
     _write(temporary / STATE_FILE, described.encode())
     fsync_folder(temporary)
@@ -64,26 +75,50 @@ def load_checkpoint(checkpoint: Path, state: TrainState, specification: NetworkS
             f"{checkpoint}: of another network: expected {specification.to_json()}, got {description['network']}; "
             "choose another run folder with --out"
         )
-    expected = {f"{name}.safetensors" for name in [*state.networks, *state.optimizers]}
+    optimizers = [f"optimizer-{part}" for part in state.optimizers]
+    expected = {f"{name}.safetensors" for name in [*state.networks, *optimizers, "extra"]}
     if set(description["files"]) != expected:
         raise UserError(f"{checkpoint}: expected {', '.join(sorted(expected))}; choose another run folder with --out")
     for name, network in state.networks.items():
         _fill(checkpoint / f"{name}.safetensors", network, read_tensors(checkpoint, description, name))
-    for name, (optimizer, trained) in state.optimizers.items():
-        _restore_moments(optimizer, trained, read_tensors(checkpoint, description, name))
+    for part, optimizer in state.optimizers.items():
+        moments = read_tensors(checkpoint, description, f"optimizer-{part}")
+        _restore_moments(optimizer, state.learned[part], moments)
+    for name, tensor in read_tensors(checkpoint, description, "extra").items():
+        state.extra[name] = tensor.to(state.extra[name].device) if name in state.extra else tensor
     state.step = int(description["step"])
 
 
-def load_policy_network(path: Path | str, step: int | None = None) -> tuple[QNetwork, dict[str, Any]]:
-    """Return the network that a run's policy uses, in evaluation mode on the CPU, and the run's configuration.
+@dataclasses.dataclass(frozen=True)
+class LoadedRun:
+    """What acts in a run, ready to act.
+
+    Attributes:
+        networks: by part, the averaged networks where the run kept them, else the trained ones; in evaluation mode, on
+            the CPU.
+        extra: what the estimator kept besides.
+        specification: of the networks.
+        config: the run's `config.json`.
+        step: training step of the checkpoint.
+        checkpoint: its folder.
+        sha256: of all weights and of `extra`, as one digest.
+    """
+
+    networks: Networks
+    extra: dict[str, Tensor]
+    specification: NetworkSpecification
+    config: dict[str, Any]
+    step: int
+    checkpoint: Path
+    sha256: str
+
+
+def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
+    """Return what acts in a run.
 
     Args:
         path: a run folder, or one of its checkpoints.
         step: training step of the checkpoint; the newest where not given.
-
-    Returns:
-        The averaged network where the run kept one, else the trained one; and `config.json` with an entry
-        `"checkpoint": {"step", "path", "sha256"}` for the weights that were loaded.
 
     Raises:
         UserError: there is no run or no such checkpoint, or it is damaged or of another network.
@@ -99,15 +134,24 @@ def load_policy_network(path: Path | str, step: int | None = None) -> tuple[QNet
             f"{checkpoint}: of another network than its run: config.json says {run.config.get('network')}, "
             f"the checkpoint {description['network']}; copy the run again"
         )
-    name = "averaged" if "averaged.safetensors" in description["files"] else "network"
-    network = make_network(specification)
-    _fill(checkpoint / f"{name}.safetensors", network, read_tensors(checkpoint, description, name))
-    loaded = {
-        "step": int(description["step"]),
-        "path": str(checkpoint),
-        "sha256": description["files"][f"{name}.safetensors"],
-    }
-    return network.eval().requires_grad_(False), run.config | {"checkpoint": loaded}
+    networks: Networks = {}
+    names = []
+    for part, outputs in description["parts"].items():
+        averaged = f"averaged-{part}.safetensors" in description["files"]
+        names.append(f"averaged-{part}" if averaged else part)
+        network = make_part(part, specification, outputs)
+        _fill(checkpoint / f"{names[-1]}.safetensors", network, read_tensors(checkpoint, description, names[-1]))
+        networks[part] = network.eval().requires_grad_(False)
+    digests = {name: description["files"][f"{name}.safetensors"] for name in [*names, "extra"]}
+    return LoadedRun(
+        networks=networks,
+        extra=read_tensors(checkpoint, description, "extra"),
+        specification=specification,
+        config=run.config,
+        step=int(description["step"]),
+        checkpoint=checkpoint,
+        sha256=_digest(digests),
+    )
 
 
 def describe(checkpoint: Path) -> dict[str, Any]:
@@ -168,7 +212,7 @@ def _digest(description: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 
-def _fill(path: Path, network: QNetwork, tensors: dict[str, Tensor]) -> None:
+def _fill(path: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
     expected = {name: list(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: list(tensor.shape) for name, tensor in tensors.items()}
     if found != expected:

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from graspq.common.options import Command, Settings, options_from, with_version
+from graspq.train.distributed import joined
 from graspq.train.loop import train
 from graspq.train.run import Run
 from graspq.train.settings import TrainOptions, resolve
@@ -20,11 +21,18 @@ def main(options: Settings) -> None:
     """Train a Q-function from shards: `grasp-train --algo mc --shards data/regular-10k`.
 
     The same command goes on where an earlier one was stopped or killed.
+
+    Several processes train one network with `torchrun --no-python --nproc-per-node 2 grasp-train ...`, each on its part
+    of every batch: --batch-size is that of all together, and they learn what one learns, up to rounding. With GPUs each
+    takes one of its own. The first alone writes the run folder, which all must see; an error of one ends all.
     """
     settings = resolve(options)
-    click.echo(f"{settings.algo}: {settings.run_folder}", err=True)
-    run = train(settings, show_progress=True)
-    click.echo(_summary(run))
+    with joined(settings.device) as ranks:
+        if ranks.first:
+            click.echo(f"{settings.algo}: {settings.run_folder}", err=True)
+        run = train(settings, show_progress=ranks.first, ranks=ranks)
+    if ranks.first:
+        click.echo(_summary(run))
 
 
 def _summary(run: Run) -> str:

@@ -13,21 +13,42 @@ import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from graspq.common.errors import UserError
+from graspq.common.named_objects import named_module
+from graspq.datasets.dataset import ShardPool
 from graspq.train.batch import Batch
-from graspq.train.selection import uniform_actions, uniform_search
-from graspq.train.state import Context
+from graspq.train.blend import blended_target, measured_regression, nothing_measured
+from graspq.train.corrected import corrected_target
+from graspq.train.ddpg import actor_critic, lagged_actor_target
+from graspq.train.pcl import consistent_value, first_penalty, path_consistency, residual
+from graspq.train.selection import uniform_search
+from graspq.train.state import Context, Parts
+from graspq.train.supervised import measured_motions, outcome_target, q_of_synthetic, synthetic_action
 from graspq.train.targets import bootstrapped, episode_value
-from graspq.train.updates import Update, regression
+from graspq.train.updates import Objective, Update, regression, regression_objective
 
 View = Literal["transitions", "episodes"]
+Acting = Literal["search", "synthetic search", "actor"]
+"""How a policy finds its action: CEM over Q; CEM over whole displacements, of which one step is taken; the actor."""
 
 
 def logged_action(batch: Batch) -> Tensor:
     """Return the actions that were taken; float32 [B, T, A]."""
     return batch.action
+
+
+def q_of_logged(batch: Batch, context: Context) -> Tensor:
+    """Return Q_θ(s_t, a_t) of every real step's logged action, on the scale of returns; float32 [n]."""
+    q_of_actions = context.network.at(batch.real(batch.image), batch.real(batch.step))
+    return q_of_actions(batch.real(batch.action).unsqueeze(1)).squeeze(1).float()
+
+
+def nothing_more(pool: ShardPool) -> dict[str, Tensor]:
+    """Return no tensors: most estimators keep their networks alone."""
+    return {}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,11 +61,18 @@ class Estimator:
         action_selection: the paper's word for how actions are picked.
         view: what a batch holds: single transitions, or whole episodes.
         needs_next: whether the target reads s'.
-        discount: γ where `--discount` is not given; None: the one that the dataset's returns were made with, and no
-            other can be given.
+        discount: γ where `--discount` is not given; None: the one that the dataset's returns were made with. The
+            batch's `mc_return` is of the run's γ: it is made anew from the rewards where the dataset's is another.
+        takes_discount: whether `--discount` can be given.
         target: (batch, context) -> float [B, T]; called without gradient, all networks in evaluation mode.
         action: the action whose Q is regressed onto the target; float [B, T, A].
         update: one step of training.
+        objective: the loss that validation reports, mean over a batch; called without gradient, in evaluation mode.
+        score: Q of every real step's action as a chance of success, float [n], for calibration and ROC AUC; None where
+            the estimator has no Q.
+        parts: its networks and their numbers of outputs.
+        acting: how its policy finds an action.
+        extra: training data -> tensors that are kept in `TrainState.extra` from the start.
     """
 
     summary: str
@@ -56,6 +84,12 @@ class Estimator:
     target: Callable[[Batch, Context], Tensor]
     action: Callable[[Batch], Tensor] = logged_action
     update: Update = regression
+    objective: Objective = regression_objective
+    score: Callable[[Batch, Context], Tensor] | None = q_of_logged
+    parts: Parts = dataclasses.field(default_factory=lambda: {"q": 1})
+    acting: Acting = "search"
+    extra: Callable[[ShardPool], dict[str, Tensor]] = nothing_more
+    takes_discount: bool = True
 
     def chosen_discount(self, given: float | None, dataset: float) -> float:
         """Return γ for a run.
@@ -65,23 +99,23 @@ class Estimator:
             dataset: that of the dataset's `mc_return`.
 
         Raises:
-            UserError: the estimator uses the dataset's returns and another discount was asked for.
+            UserError: a discount was given to an estimator that takes none.
         """
-        if self.discount is not None:
-            return self.discount if given is None else given
-        if given is not None and given != dataset:
+        if given is not None and not self.takes_discount:
             raise UserError(
-                f"--discount: {self.target_value!r} targets are the dataset's returns, made with discount {dataset:g}, "
-                f"got {given:g}; leave the option out, or collect the dataset with that discount"
+                f"--discount: {self.target_value!r} targets have no discount, got {given:g}; leave the option out"
             )
-        return dataset
+        if given is not None:
+            return given
+        return dataset if self.discount is None else self.discount
 
 
 def monte_carlo_target(batch: Batch, context: Context) -> Tensor:
     """Return the observed return; see `targets.episode_value`.
 
     Source: Quillen et al. 2018, section "Regression with Monte Carlo Return Estimates".
-    Differs: 1. No discount, as the paper's footnote and its code have it; its formula has one.
+    Differs: 1. No discount by default, as the paper's footnote and its code have it; its formula has one. With
+    `--discount` the returns are made anew from the rewards.
     """
     return episode_value(batch.mc_return)
 
@@ -98,13 +132,27 @@ def double_q_target(batch: Batch, context: Context) -> Tensor:
     if batch.next_image is None or batch.next_step is None:
         raise ValueError("a bootstrapped target needs next_image and next_step in the batch")
     image, step = batch.next_image.flatten(0, 1), batch.next_step.flatten()
-    drawn = uniform_actions(context.generator, len(step), context.candidates, batch.action.shape[-1])
-    best = uniform_search(context.network.at(image, step), drawn.to(image.device))
+    drawn = context.candidate_actions(torch.ones_like(batch.terminal), batch.action.shape[-1])
+    best = uniform_search(context.network.at(image, step), drawn)
     next_value = context.lagged.at(image, step)(best.action.unsqueeze(1)).squeeze(1)
     return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), context.discount)
 
 
 ESTIMATORS: dict[str, Estimator] = {
+    "supervised": Estimator(
+        summary="The outcome of the episode, as if one motion had led from the current pose to the last one",
+        target_value="episode value, on synthetic actions",
+        action_selection="stochastic search",
+        view="transitions",
+        needs_next=False,
+        discount=1.0,
+        target=outcome_target,
+        action=synthetic_action,
+        score=q_of_synthetic,
+        acting="synthetic search",
+        extra=measured_motions,
+        takes_discount=False,
+    ),
     "dql": Estimator(
         summary="Double Q-learning: the reward and the discounted value of the best next action",
         target_value="bootstrapped (double Q, lagged target network)",
@@ -123,18 +171,75 @@ ESTIMATORS: dict[str, Estimator] = {
         discount=None,
         target=monte_carlo_target,
     ),
+    "corr-mc": Estimator(
+        summary="Monte-Carlo returns, corrected by how much worse than the best the later actions were",
+        target_value="corrected episode value, coefficient nu annealed 0 -> 1",
+        action_selection="stochastic search",
+        view="episodes",
+        needs_next=False,
+        discount=0.9,
+        target=corrected_target,
+    ),
+    "ddpg": Estimator(
+        summary="Deep deterministic policy gradient: a network learns to give the action that Q rates best",
+        target_value="bootstrapped",
+        action_selection="actor network",
+        view="transitions",
+        needs_next=True,
+        discount=0.9,
+        target=lagged_actor_target,
+        update=actor_critic,
+        parts={"q": 1, "actor": 4},
+        acting="actor",
+    ),
+    "pcl": Estimator(
+        summary="Trust-PCL: V and a Gaussian policy, made consistent along logged paths near its lagged copy",
+        target_value="corrected episode value (Trust-PCL: relative entropy to a lagged policy)",
+        action_selection="actor network",
+        view="episodes",
+        needs_next=False,
+        discount=0.9,
+        target=consistent_value,
+        update=path_consistency,
+        objective=residual,
+        score=None,
+        parts={"v": 1, "actor": 8},
+        acting="actor",
+        extra=first_penalty,
+    ),
+    "blend": Estimator(
+        summary="Beyond the paper: bootstrapped where Q is found right on the data, else the corrected return",
+        target_value="between bootstrapped and corrected episode value, by the error that is measured",
+        action_selection="stochastic search",
+        view="episodes",
+        needs_next=False,
+        discount=0.9,
+        target=blended_target,
+        update=measured_regression,
+        extra=nothing_measured,
+    ),
 }
 
 
 def estimator_named(name: str) -> Estimator:
-    """Return the row of `--algo`.
+    """Return the row of `--algo`: one of the table's, or a user's own as `module:row`.
 
     Raises:
-        UserError: there is none of that name.
+        UserError: there is none of that name, or what is there is no row.
     """
-    if name not in ESTIMATORS:
-        raise UserError(f"--algo: {name!r} is unknown; choose from {', '.join(ESTIMATORS)}")
-    return ESTIMATORS[name]
+    if name in ESTIMATORS:
+        return ESTIMATORS[name]
+    module_name, _, row_name = name.partition(":")
+    if not module_name or not row_name:
+        raise UserError(f"--algo: {name!r} is unknown; choose from {', '.join(ESTIMATORS)}, or module:row of your own")
+    try:
+        row = getattr(named_module(module_name), row_name, None)
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UserError(f"--algo: {name}: cannot be imported ({reason}); run it where {module_name} is") from error
+    if not isinstance(row, Estimator):
+        raise UserError(f"--algo: {name}: expected an Estimator, {module_name} has {type(row).__name__} {row_name!r}")
+    return row
 
 
 def as_markdown() -> str:

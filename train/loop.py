@@ -5,32 +5,33 @@ and started again ends in the same weights: bit for bit on a CPU with the same n
 driver's kernels are deterministic on a GPU.
 """
 
+import contextlib
 import dataclasses
-import itertools
-import signal
-import threading
 from collections.abc import Iterator
-from types import FrameType
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
+import click
 import torch
 from torch import Tensor
 
 from graspq.common.errors import UserError
 from graspq.common.provenance import code_revision, versions
-from graspq.datasets.batch import EpisodeBatch, TransitionBatch
 from graspq.datasets.dataset import ShardPool, open_shards
-from graspq.datasets.loader import EpisodeLoader, TransitionLoader, episode_batches, transition_batches
 from graspq.train.augment import Augmentation
-from graspq.train.batch import Batch, to_tensors
-from graspq.train.checkpoint import load_checkpoint, remove_unfinished, save_checkpoint
+from graspq.train.batch import Batch
+from graspq.train.batches import batch_rows, held_back_batches, training_batches
+from graspq.train.checkpoint import load_checkpoint, save_checkpoint
+from graspq.train.distributed import ALONE, WHOLE, BatchPart, Ranks, unite
 from graspq.train.estimators import Estimator, estimator_named
-from graspq.train.hardware import Precision, chosen_device, chosen_precision, prepare
-from graspq.train.networks import NetworkSpecification, QNetwork
+from graspq.train.hardware import Precision, chosen_device, compile_networks, prepare
+from graspq.train.interruption import Interruption
+from graspq.train.networks import NetworkSpecification
+from graspq.train.opening import is_compiled, opened, precision_of
 from graspq.train.progress import Progress
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
-from graspq.train.state import Context, TrainState, advance, learning_rate, new_state, seeded
+from graspq.train.state import Context, Networks, TrainState, advance, learning_rate, new_state, seeded
 from graspq.train.updates import LINKS
 from graspq.train.validation import Validation, validate
 
@@ -38,44 +39,85 @@ ACTIONS = 4
 
 
 class DivergedError(UserError):
-    """Training met a number that is not finite."""
+    """Training met a number that is not finite, or values far beyond what the task allows."""
 
 
-def train(settings: TrainSettings, *, stop_at: int | None = None, show_progress: bool = False) -> Run:
+def train(
+    settings: TrainSettings, *, stop_at: int | None = None, show_progress: bool = False, ranks: Ranks = ALONE
+) -> Run:
     """Train to the last step, from the newest checkpoint of the run folder where there is one.
 
     Args:
         settings: everything about the run.
         stop_at: stop, with a checkpoint, after this step as if interrupted; None runs to the end.
         show_progress: show a progress bar on standard error.
+        ranks: those that train together, each calling this; see `distributed.joined`.
 
     Raises:
         UserError: data, run folder or a setting are not usable; see the message.
-        DivergedError: a loss or weight was not finite; the newest checkpoint is from before.
+        DivergedError: a loss or weight was not finite, or values far beyond [0, 1]; the newest checkpoint is from
+            before.
         KeyboardInterrupt: SIGINT or SIGTERM came; a checkpoint of the last step was written first.
+    """
+    pool = open_shards(settings.shards)
+    training, held_back = pool.split(settings.validation_fraction, settings.seed)
+    with session(settings, pool, training, held_back, ranks=ranks) as current:
+        last = settings.steps if stop_at is None else min(stop_at, settings.steps)
+        current.steps(training, last, show_progress)
+    return current.run
+
+
+@contextlib.contextmanager
+def session(
+    settings: TrainSettings,
+    pool: ShardPool,
+    training: ShardPool,
+    held_back: ShardPool,
+    *,
+    start: Path | None = None,
+    described: dict[str, Any] | None = None,
+    ranks: Ranks = ALONE,
+) -> Iterator["Session"]:
+    """Open a run's folder for these ranks alone: a new one, or the one that is there, at its newest checkpoint.
+
+    Args:
+        settings: everything about the run.
+        pool: all data, as `config.json` describes them.
+        training: part of the pool to train on.
+        held_back: part of the pool to validate on.
+        start: checkpoint of another run that a new run goes on from; its own weights at step 0 where not given.
+        described: further entries of `config.json`.
+        ranks: those that train together.
+
+    Raises:
+        UserError: data, run folder or a setting are not usable; see the message.
     """
     prepare(settings)
     estimator = estimator_named(settings.algo)
-    pool = open_shards(settings.shards)
-    training, held_back = pool.split(settings.validation_fraction, settings.seed)
     discount = estimator.chosen_discount(settings.discount, pool.discount)
     specification = NetworkSpecification(
-        settings.network, pool.image_shape, ACTIONS, pool.max_steps, LINKS[settings.loss]
+        settings.network, pool.image_shape, ACTIONS, pool.max_steps, LINKS[settings.loss], settings.width
     )
-    state = new_state(specification, settings, chosen_device(settings.device))
-    config = _configuration(settings, specification, pool, training, held_back, discount)
-    run = Run.create_or_resume(settings.run_folder, config)
-    with run.locked():
-        precision = _precision(run, settings, state.network, pool.image_shape)
-        remove_unfinished(run.checkpoints_folder)
-        newest = run.latest_checkpoint()
-        if newest is not None:
-            load_checkpoint(newest, state, specification)
+    device = chosen_device(settings.device)
+    state = new_state(specification, settings, device, estimator.parts, estimator.extra(training))
+    if ranks.first and discount != pool.discount and (estimator.discount is None or not estimator.takes_discount):
+        stored = f"the data's are of discount {pool.discount:g}"
+        click.echo(f"{settings.algo}: returns are made from the rewards with discount {discount:g}; {stored}", err=True)
+    config = _configuration(settings, specification, pool, training, held_back, discount) | (described or {})
+    with opened(settings.run_folder, config, ranks) as run:
+        precision = ranks.from_first(lambda: precision_of(run, settings, specification, device))
+        compiled = ranks.from_first(lambda: is_compiled(run, settings, specification, precision))
+        newest = ranks.from_first(run.latest_checkpoint)
+        loaded = newest if newest is not None else start
+        if loaded is not None:
+            load_checkpoint(loaded, state, specification)
         run.forget_after(state.step)
-        session = _Session(settings, estimator, specification, run, state, precision, discount, held_back)
-        last = settings.steps if stop_at is None else min(stop_at, settings.steps)
-        session.steps(training, last, show_progress)
-    return run
+        ranks.spread(state.tensors)
+        unite(state.learned.values(), state.optimizers.values(), ranks)
+        if compiled:
+            compile_networks(state.networks.values())
+        saved = state.step if newest is not None else None
+        yield Session(settings, estimator, specification, run, state, precision, discount, held_back, ranks, saved)
 
 
 def _configuration(
@@ -91,6 +133,7 @@ def _configuration(
         "command": "grasp-train",
         "settings": settings.to_json(),
         "discount": discount,
+        "mc_return": "as stored" if discount == pool.discount else f"made from the rewards with discount {discount:g}",
         "network": specification.to_json(),
         "dataset": {
             "manifest_sha256": pool.manifest_digest,
@@ -107,20 +150,9 @@ def _configuration(
     }
 
 
-def _precision(run: Run, settings: TrainSettings, network: QNetwork, image_shape: tuple[int, int, int]) -> Precision:
-    """Return the precision that the run was begun with on such a device, or choose one and note it in the run."""
-    device = next(network.parameters()).device
-    known = run.config.get("precision", {})
-    if settings.precision == "auto" and known.get("device") == device.type:
-        return Precision(known["name"], device, known["probe"])
-    chosen = chosen_precision(settings.precision, network, image_shape)
-    run.note("precision", {"name": chosen.name, "device": device.type, "probe": chosen.probe})
-    return chosen
-
-
 @dataclasses.dataclass
-class _Session:
-    """One process's part of a run."""
+class Session:
+    """One process's part of a run; see `session`."""
 
     settings: TrainSettings
     estimator: Estimator
@@ -130,64 +162,70 @@ class _Session:
     precision: Precision
     discount: float
     held_back: ShardPool
+    ranks: Ranks = ALONE
     saved_step: int | None = None
+    watched: dict[str, Tensor] = dataclasses.field(default_factory=dict)
 
     def steps(self, pool: ShardPool, last: int, show_progress: bool) -> None:
-        """Train until step `last`."""
+        """Train on `pool` until step `last`, and leave a checkpoint of it."""
         settings, state = self.settings, self.state
         if state.step >= last:
             return
         augmentation = Augmentation(settings.shift, settings.mirror, settings.jitter, settings.action_noise)
-        loader = self._loader(pool)
+        pool = pool.with_discount(self.discount)
+        rows = batch_rows(pool, settings, self.estimator)
+        device, ranks = self.precision.device, self.ranks
+        source = training_batches(pool, settings, self.estimator, device, state.step, ranks)
         progress = Progress(self.run, settings, state.step, show_progress)
-        with loader, progress, _Interruption() as interruption:
-            while state.step < last and not interruption.requested:
+        with source as batches, progress, Interruption() as interruption:
+            while state.step < last and not ranks.any(interruption.requested):
                 with progress.timed():
-                    batch = to_tensors(cast(TransitionBatch | EpisodeBatch, next(loader)), self.precision.device)
-                    batch = augmentation(batch, seeded("train/augment", settings.seed, state.step))
-                    loss = self._update(batch)
-                progress.count(state.step, loss)
+                    batch = next(batches)
+                    part = BatchPart.of(ranks, rows, batch.real_steps)
+                    batch = augmentation(batch, seeded("train/augment", settings.seed, state.step), part)
+                    loss = self._update(batch, part)
+                progress.count(loss, self.watched)
                 self._after_step(progress)
             if self.saved_step != state.step:
                 self._log(progress)
-                self._save()
-        if interruption.requested:
+                self.save()
+            # Together: `torchrun` ends the others as soon as one has gone.
+            interrupted = ranks.any(interruption.requested)
+        if interrupted:
             raise KeyboardInterrupt
 
-    def _loader(self, pool: ShardPool) -> TransitionLoader | EpisodeLoader:
-        settings, start = self.settings, self.state.step
-        if self.estimator.view == "episodes":
-            return EpisodeLoader(pool, settings.batch_size, settings.seed, settings.buffer_bytes, start)
-        return TransitionLoader(
-            pool,
-            settings.batch_size,
-            settings.seed,
-            settings.buffer_bytes,
-            start,
-            need_next=self.estimator.needs_next,
-        )
-
-    def _update(self, batch: Batch) -> Tensor:
+    def _update(self, batch: Batch, part: BatchPart) -> Tensor:
         """Take one step; return its loss."""
         rate = learning_rate(self.settings, self.state.step)
-        for optimizer, _ in self.state.optimizers.values():
+        for optimizer in self.state.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = rate
-        context = self._context(self.state.network, seeded("train/candidates", self.settings.seed, self.state.step))
+        generator = seeded("train/candidates", self.settings.seed, self.state.step)
+        context = self._context(self.state.learned, generator, part)
         loss = self.estimator.update(self.state, batch, self.estimator, context)
         advance(self.state, self.settings)
-        return loss
+        for name, value in self.watched.items():
+            self.watched[name] = part.mean(value)
+        return part.mean(loss)
 
-    def _context(self, network: QNetwork, generator: torch.Generator) -> Context:
+    def _context(self, networks: Networks, generator: torch.Generator, part: BatchPart = WHOLE) -> Context:
         return Context(
-            network=network,
-            lagged=self.state.lagged,
+            networks=networks,
+            lagged_networks=self.state.lagged,
             loss=self.settings.loss,
             discount=self.discount,
             candidates=self.settings.candidates,
             generator=generator,
             progress=self.state.step / self.settings.steps,
             autocast=self.precision.autocast,
+            extra=self.state.extra,
+            anneal=self.settings.anneal,
+            actor_rest=self.settings.actor_rest,
+            path_steps=self.settings.path_steps,
+            penalty=self.settings.penalty,
+            kl_bound=self.settings.kl_bound,
+            watched=self.watched,
+            part=part,
         )
 
     def _after_step(self, progress: Progress) -> None:
@@ -199,72 +237,44 @@ class _Session:
             self._log(progress)
         if finished or step % settings.validate_every == 0:
             self._check_weights()
-            result = self.validate()
+            result = self.validate() if self.ranks.first else None
             if result is not None:
                 progress.log_validation(step, result)
         if saves:
-            self._save()
+            self.save()
 
     def _log(self, progress: Progress) -> None:
         bad = progress.log(self.state.step, learning_rate(self.settings, self.state.step - 1))
         if bad is not None:
-            self._diverged(bad, "loss")
+            self._diverged(*bad)
 
     def validate(self) -> Validation | None:
-        """Judge the policy's network on held-back transitions; the same ones and the same candidates each time."""
-        context = self._context(self.state.policy_network, seeded("train/validation", self.settings.seed))
-        return validate(self._held_back_batches(), self.estimator, context)
-
-    def _held_back_batches(self) -> Iterator[Batch]:
-        rows = itertools.accumulate(ref.rows for ref in self.held_back.blocks)
-        kept = sum(1 for total in rows if total <= self.settings.validation_transitions)
-        pool = dataclasses.replace(self.held_back, blocks=self.held_back.blocks[: max(kept, 1)])
-        size = self.settings.batch_size
-        if self.estimator.view == "episodes":
-            yield from (to_tensors(batch, self.precision.device) for batch in episode_batches(pool, size))
-        else:
-            batches = transition_batches(pool, size, self.estimator.needs_next)
-            yield from (to_tensors(batch, self.precision.device) for batch in batches)
+        """Judge the policy's networks on held-back transitions; the same ones and the same candidates each time."""
+        context = self._context(self.state.acting, seeded("train/validation", self.settings.seed))
+        held_back = self.held_back.with_discount(self.discount)
+        batches = held_back_batches(held_back, self.settings, self.estimator, self.precision.device)
+        return validate(batches, self.estimator, context)
 
     def _check_weights(self) -> None:
         for name, network in self.state.networks.items():
             for part, tensor in network.state_dict().items():
                 if not bool(torch.isfinite(tensor).all()):
-                    self._diverged(self.state.step, f"{part} of the {name} network")
+                    self._diverged(self.state.step, f"{part} of the {name} network is not finite")
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write a checkpoint of the step, unless there is one."""
+        if self.saved_step == self.state.step:
+            return
         self._check_weights()
-        save_checkpoint(self.run.checkpoints_folder, self.state, self.specification)
+        if self.ranks.first:
+            save_checkpoint(self.run.checkpoints_folder, self.state, self.specification)
         self.run.prune(self.settings.keep_checkpoints)
         self.saved_step = self.state.step
 
-    def _diverged(self, step: int, quantity: str) -> None:
+    def _diverged(self, step: int, found: str) -> None:
         newest = self.run.latest_checkpoint()
         kept = f"{newest} is the last good checkpoint" if newest is not None else "no checkpoint was written yet"
         raise DivergedError(
-            f"{self.settings.algo} diverged at step {step}: the {quantity} is not finite; {kept}; "
+            f"{self.settings.algo} diverged at step {step}: the {found}; {kept}; "
             "try a lower --learning-rate with another --out"
         )
-
-
-class _Interruption:
-    """Notes SIGINT and SIGTERM so that the step that runs ends first; a second one interrupts at once."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._previous: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> "_Interruption":
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)

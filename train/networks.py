@@ -1,12 +1,12 @@
 """What a Q-network is, and the table of networks that `--network` chooses from.
 
-A network computes everything that depends on the state alone once, in its trunk, and judges any number of candidate
-actions with a light head. Dimensions: B batch, N candidates, A action, H W C image.
+A Q-network computes everything that depends on the state alone once, in its trunk, and judges any number of candidate
+actions with a light head. Dimensions: B batch, N candidates, A action, O outputs, H W C image.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
@@ -62,11 +62,25 @@ class QNetwork(nn.Module):
         return lambda action: self.value_of(self.head(features, action))
 
 
+class StateNetwork(nn.Module):
+    """A function of the state alone: V(s), or what an actor's action is made of."""
+
+    def forward(self, image: Tensor, step: Tensor) -> Tensor:
+        """Return raw outputs, float32 [B, O].
+
+        Args:
+            image: uint8 [B, H, W, C].
+            step: int64 [B], 0 at the first step of an episode.
+        """
+        raise NotImplementedError
+
+
 @dataclasses.dataclass(frozen=True)
 class NetworkSpecification:
     """Everything needed to build a network again: what a checkpoint says about itself.
 
     `image_shape` is (H, W, C), `actions` the number of action dimensions, `steps` T, the most steps of an episode.
+    `width` is the number of channels and units of the paper's network; the default network has its own.
     """
 
     name: str
@@ -74,6 +88,7 @@ class NetworkSpecification:
     actions: int
     steps: int
     link: Link
+    width: int = 32
 
     def to_json(self) -> dict[str, Any]:
         """Return the specification as plain JSON values."""
@@ -94,7 +109,7 @@ class NetworkSpecification:
 
 
 def make_network(specification: NetworkSpecification, generator: torch.Generator | None = None) -> QNetwork:
-    """Return a freshly initialised network on the CPU.
+    """Return a freshly initialised Q-network on the CPU.
 
     Args:
         specification: which network, for which states and actions.
@@ -104,33 +119,58 @@ def make_network(specification: NetworkSpecification, generator: torch.Generator
     Raises:
         UserError: the name is unknown, or the images are too small for the network.
     """
-    if specification.name not in NETWORKS:
-        raise UserError(f"--network: {specification.name!r} is unknown; choose from {', '.join(NETWORKS)}")
-    if generator is None:
-        network = NETWORKS[specification.name](specification)
-    else:
-        seed = int(torch.randint(2**62, (), generator=generator))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = NETWORKS[specification.name](specification)
+    network = _seeded(generator, lambda: _family(specification).q(specification))
     network.link = specification.link
     # torch's annotations do not know that modules take a memory format.
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-def _paper(specification: NetworkSpecification) -> QNetwork:
-    from graspq.train.paper_network import PaperNetwork
-
-    return PaperNetwork(specification)
-
-
-def _default(specification: NetworkSpecification) -> QNetwork:
-    from graspq.train.default_network import DefaultNetwork
-
-    return DefaultNetwork(specification)
+def make_state_network(
+    specification: NetworkSpecification, outputs: int, generator: torch.Generator | None = None
+) -> StateNetwork:
+    """Return a freshly initialised function of the state with O = `outputs` outputs; see `make_network`."""
+    network = _seeded(generator, lambda: _family(specification).state(specification, outputs))
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-NETWORKS: dict[str, Callable[[NetworkSpecification], QNetwork]] = {
+Module = TypeVar("Module", bound=nn.Module)
+
+
+def _seeded(generator: torch.Generator | None, make: Callable[[], Module]) -> Module:
+    if generator is None:
+        return make()
+    seed = int(torch.randint(2**62, (), generator=generator))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()
+
+
+class _Family(NamedTuple):
+    """The networks of one `--network`."""
+
+    q: Callable[[NetworkSpecification], QNetwork]
+    state: Callable[[NetworkSpecification, int], StateNetwork]
+
+
+def _family(specification: NetworkSpecification) -> _Family:
+    if specification.name not in NETWORKS:
+        raise UserError(f"--network: {specification.name!r} is unknown; choose from {', '.join(NETWORKS)}")
+    return NETWORKS[specification.name]()
+
+
+def _paper() -> _Family:
+    from graspq.train.paper_network import PaperNetwork, PaperStateNetwork
+
+    return _Family(PaperNetwork, PaperStateNetwork)
+
+
+def _default() -> _Family:
+    from graspq.train.default_network import DefaultNetwork, DefaultStateNetwork
+
+    return _Family(DefaultNetwork, DefaultStateNetwork)
+
+
+NETWORKS: dict[str, Callable[[], _Family]] = {
     "default": _default,
     "paper": _paper,
 }

@@ -4,9 +4,10 @@ Losses stay on their device until a row is logged, so that a GPU never waits for
 """
 
 import contextlib
+import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -17,6 +18,9 @@ from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
 from graspq.train.validation import Validation
 
+# Of mean absolute values of returns, which lie in [0, 1].
+LARGEST = 10.0
+
 
 class Progress:
     """Collects losses and times between two rows of metrics; a context manager."""
@@ -26,7 +30,8 @@ class Progress:
         from torch.utils.tensorboard import SummaryWriter
 
         self._run, self._batch_size = run, settings.batch_size
-        self._writer = SummaryWriter(str(run.folder / "tensorboard"), purge_step=step + 1)
+        folder = str(run.folder / "tensorboard")
+        self._writer = SummaryWriter(folder, purge_step=step + 1) if run.writes else None
         # A log file gets a line every half minute instead of a moving bar.
         interval = 0.5 if sys.stderr.isatty() else 30.0
         self._bar = tqdm(
@@ -41,6 +46,7 @@ class Progress:
         )
         self._shown: dict[str, str] = {}
         self._losses: list[Tensor] = []
+        self._watched: dict[str, list[Tensor]] = {}
         self._first = step + 1
         self._seconds = 0.0
 
@@ -49,7 +55,8 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
 
     @contextlib.contextmanager
     def timed(self) -> Iterator[None]:
@@ -58,21 +65,28 @@ class Progress:
         yield
         self._seconds += time.perf_counter() - start
 
-    def count(self, step: int, loss: Tensor) -> None:
-        """Note a step that was taken and its loss."""
+    def count(self, loss: Tensor, watched: Mapping[str, Tensor]) -> None:
+        """Note a step that was taken: its loss, and mean absolute values that the task keeps near [0, 1], by name."""
         self._losses.append(loss)
+        for name, value in watched.items():
+            self._watched.setdefault(name, []).append(value.detach())
         self._bar.update(1)
 
-    def log(self, step: int, learning_rate: float) -> int | None:
-        """Write a row for the steps since the last one; return the first step whose loss was not finite, else None."""
+    def log(self, step: int, learning_rate: float) -> tuple[int, str] | None:
+        """Write a row for the steps since the last one, unless they diverged.
+
+        Returns:
+            The first step that diverged and what was found there, else None. Returns lie in [0, 1]: a mean beyond ±10
+            is no estimate of one.
+        """
         if not self._losses:
             return None
         start = time.perf_counter()
         losses = torch.stack(self._losses).cpu()
         self._seconds += time.perf_counter() - start
-        bad = torch.nonzero(~torch.isfinite(losses))
-        if len(bad):
-            return self._first + int(bad[0])
+        diverged = self._diverged(losses)
+        if diverged is not None:
+            return diverged
         rate = len(losses) * self._batch_size / self._seconds
         row = {
             "step": step,
@@ -84,6 +98,18 @@ class Progress:
         self._to_tensorboard("train", {name: value for name, value in row.items() if name != "step"}, step)
         self._show({"loss": f"{row['loss']:.4f}", "samples/s": f"{rate:.0f}"})
         self._losses, self._first, self._seconds = [], step + 1, 0.0
+        self._watched = {}
+        return None
+
+    def _diverged(self, losses: Tensor) -> tuple[int, str] | None:
+        watched = {name: torch.stack(values).cpu() for name, values in self._watched.items()}
+        for index, loss in enumerate(losses.tolist()):
+            if not math.isfinite(loss):
+                return self._first + index, "loss is not finite"
+            for name, values in watched.items():
+                value = float(values[index])
+                if not abs(value) <= LARGEST:
+                    return self._first + index, f"mean |{name}| is {value:.3g}, and returns lie in [0, 1]"
         return None
 
     def log_validation(self, step: int, result: Validation) -> None:
@@ -98,7 +124,7 @@ class Progress:
 
     def _to_tensorboard(self, group: str, values: dict[str, Any], step: int) -> None:
         for name, value in values.items():
-            if isinstance(value, int | float):
+            if self._writer is not None and isinstance(value, int | float):
                 self._writer.add_scalar(f"{group}/{name}", value, step)
 
     def _show(self, values: dict[str, str]) -> None:

@@ -27,6 +27,8 @@ FREE_SETTINGS = frozenset(
         "log_every",
         "device",
         "precision",
+        "resident",
+        "compile",
         "threads",
     }
 )
@@ -49,7 +51,10 @@ class Run:
     Attributes:
         folder: the folder.
         config: the content of `config.json`.
+        writes: whether this process writes the folder; see `Witness`.
     """
+
+    writes = True
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
@@ -94,10 +99,11 @@ class Run:
                     f"{self.folder}: holds a run with {name} = {ours.get(name)}, not {theirs.get(name)}; "
                     "choose another folder with --out, or delete it"
                 )
-        for part in ("network", "dataset"):
-            if self.config.get(part) != config[part]:
+        for part in ("network", "dataset", "online"):  # "online" is that of grasp-online alone
+            there, here = self.config.get(part), config.get(part)
+            if there != here:
                 raise UserError(
-                    f"{self.folder}: holds a run with another {part} ({self.config.get(part)}, now {config[part]}); "
+                    f"{self.folder}: holds a run with another {part} ({there}, now {here}); "
                     "choose another folder with --out, or delete it"
                 )
 
@@ -180,3 +186,22 @@ class Run:
         rows = [row for row in self.metrics() if row["step"] <= step]
         if self.metrics_file.exists():
             write_text(self.metrics_file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+
+
+class Witness(Run):
+    """The run as seen by a process that trains with the one that writes it: it reads, and its writing does nothing."""
+
+    writes = False
+
+    def note(self, name: str, value: Any) -> None:
+        """Keep an entry of `config.json` in memory."""
+        self.config[name] = value
+
+    def prune(self, keep: int) -> None:
+        """Do nothing."""
+
+    def append_metrics(self, row: dict[str, Any]) -> None:
+        """Do nothing."""
+
+    def forget_after(self, step: int) -> None:
+        """Do nothing."""

@@ -32,6 +32,10 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "mirror": True,
         "jitter": 0.0,
         "action_noise": 0.0,
+        "anneal": 0.5,
+        "actor_rest": 0.1,
+        "path_steps": None,
+        "penalty": None,
         "precision": "auto",
     },
     # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
@@ -49,6 +53,10 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "mirror": False,
         "jitter": 0.0,
         "action_noise": 0.0,
+        "anneal": 0.05,
+        "actor_rest": 0.0,
+        "path_steps": 10,
+        "penalty": 3.0,
         "precision": "float32",
     },
 }
@@ -80,6 +88,7 @@ class TrainSettings(Settings):
     preset: PresetName = setting("default", help="Values of all options marked with two values in brackets.")
     steps: int = _preset_setting("steps", help="Gradient steps, such as 8000 or 8k.", minimum=1, parse=parse_count)
     network: Literal["default", "paper"] = _preset_setting("network", help="Q-network.")
+    width: int = setting(32, help="Channels and units of the paper's network.", minimum=1)
     loss: LossName = _preset_setting("loss", help="Loss between Q and target.")  # noqa: RUF009
     batch_size: int = _preset_setting("batch_size", help="Transitions of a gradient step.", minimum=2)
     learning_rate: float = _preset_setting("learning_rate", help="Highest learning rate of AdamW.", minimum=0)
@@ -106,8 +115,34 @@ class TrainSettings(Settings):
     action_noise: float = _preset_setting(
         "action_noise", help="Standard deviation of noise on logged actions, in units of the limits.", minimum=0
     )
+    anneal: float = _preset_setting(
+        "anneal",
+        help="Part of the steps over which the correction of corr-mc rises from 0 to 1; 0: all at once.",
+        minimum=0,
+        maximum=1,
+    )
+    actor_rest: float = _preset_setting(
+        "actor_rest",
+        help="Part of the steps in which ddpg's actor stays as it began, while Q learns.",
+        minimum=0,
+        maximum=1,
+    )
+    path_steps: int | None = _preset_setting(
+        "path_steps", help="Steps d of a path of pcl; the rest of the episode where it is not given.", minimum=1
+    )
+    penalty: float | None = _preset_setting(
+        "penalty",
+        help="Weight of pcl's relative entropy to the lagged policy; tuned to --kl-bound where it is not given.",
+        minimum=1e-6,
+    )
+    kl_bound: float = setting(
+        0.02, help="Mean relative entropy to the lagged policy that pcl's weight is tuned to, nats.", minimum=1e-6
+    )
     discount: float | None = setting(
-        None, help="Discount of bootstrapped targets, 0 to 1; 0.9 where it is not given.", minimum=0, maximum=1
+        None,
+        help="Discount, 0 to 1. Default: 0.9, but the data's own for mc; supervised has none and takes none.",
+        minimum=0,
+        maximum=1,
     )
     lag_steps: int = setting(50, help="Steps between copies of the weights into the lagged network.", minimum=1)
     candidates: int = setting(16, help="Uniform actions among which a target looks for the best.", minimum=1)
@@ -127,6 +162,16 @@ class TrainSettings(Settings):
     device: Literal["auto", "cpu", "cuda"] = setting("auto", help="Where to train; auto takes a GPU if there is one.")
     precision: Literal["auto", "float32", "bfloat16"] = _preset_setting(
         "precision", help="Arithmetic of the networks; auto tries both at the start and takes the faster right one."
+    )
+    resident: Literal["auto", "yes", "no"] = setting(
+        "auto",
+        help="Keep all images as uint8 on the device, instead of streaming them; the batches are the same. auto: on a "
+        "GPU where they fit into 60 % of its free memory.",
+    )
+    compile: Literal["auto", "yes", "no"] = setting(
+        "auto",
+        help="torch.compile for the networks. auto tries it on a GPU at the start, and takes it where it is faster and "
+        "right; on a CPU it is off: there it took a minute of compiling and was then no faster.",
     )
     threads: int | None = setting(None, help="CPU threads of torch; its own choice where not given.", minimum=1)
 
@@ -149,7 +194,7 @@ class TrainSettings(Settings):
         path = Path(self.shards[0])
         named = path.parent.parent if path.suffix == ".parquet" else path
         dataset = re.sub(r"[^A-Za-z0-9._-]+", "-", named.absolute().name).strip("-") or "data"
-        return Path("runs") / f"{self.algo}-{dataset}-seed{self.seed}"
+        return Path("runs") / f"{self.algo.replace(':', '-')}-{dataset}-seed{self.seed}"
 
 
 def _options_type() -> type[Settings]:

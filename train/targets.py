@@ -50,6 +50,80 @@ def episode_value(observed_return: Tensor) -> Tensor:
     return observed_return
 
 
+def corrected_episode_value(
+    reward: Tensor, advantage: Tensor, nu: float, discount: float, mask: Tensor | None = None
+) -> Tensor:
+    """Return the observed return, corrected for every later action that was not the best.
+
+        y_t = Σ_{t'=t}^{T} γ^{t'-t} r_t' - ν Σ_{t'=t+1}^{T} γ^{t'-t} A(s_t', a_t'),
+        by the recursion  y_t = r_t + γ (y_{t+1} - ν A_{t+1}),  y_{T+1} = A_{T+1} = 0
+
+    With ν = 1 and A = Q - V of the best policy its mean is that policy's Q; with ν = 0 it is the observed return. No
+    advantage is larger than 0, so the correction can only raise the target, and with rewards of at most 1 above 1. It
+    must not be clipped: the mean of clipped targets is not the clipped mean.
+
+    Args:
+        reward: float [B, T], whole episodes.
+        advantage: A(s_t, a_t), float [B, T]; that of the first step is not read (it may be NaN).
+        nu: coefficient ν of the correction, in [0, 1].
+        discount: γ in [0, 1].
+        mask: bool [B, T], false where an episode has already ended; nothing is read there and the result is 0.
+
+    Returns:
+        float [B, T].
+
+    Source: Quillen et al. 2018, section "Corrected Monte Carlo Evaluation", last equation.
+    """
+    _check_shapes(reward, advantage, mask)
+    nothing = torch.zeros_like(advantage[:, :1])
+    later = torch.cat([advantage[:, 1:], nothing], dim=1)
+    later_mask = None if mask is None else torch.cat([mask[:, 1:], nothing.bool()], dim=1)
+    correction = discount * discounted_return(later, discount, later_mask)
+    return discounted_return(reward, discount, mask) - nu * correction
+
+
+def path_consistent(
+    reward: Tensor,
+    value: Tensor,
+    log_ratio: Tensor,
+    penalty: Tensor | float,
+    discount: float,
+    path_steps: int | None = None,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Return what Trust-PCL wants V(s_t) to be: the return less the penalties along the logged path, and V after it.
+
+        y_t = γᵈ V(s_{t+d}) + Σ_{i=0}^{d-1} γⁱ (r_{t+i} - λ ρ_{t+i}),  ρ = log π(a|s) - log π'(a|s),
+        V = r = ρ = 0 after the end
+
+    The corrected episode value with λ ρ for the advantage, which also counts at the first step: V is wanted here, not
+    Q. Gradients flow through `value` and `log_ratio`.
+
+    Args:
+        reward: float [B, T], whole episodes.
+        value: V(s_t), float [B, T].
+        log_ratio: ρ_t, float [B, T].
+        penalty: λ, at least 0; a scalar.
+        discount: γ in [0, 1].
+        path_steps: d, at least 1; None is the rest of the episode.
+        mask: bool [B, T], false where an episode has already ended; nothing is read there and the result is 0.
+
+    Returns:
+        float [B, T].
+
+    Source: Quillen et al. 2018, section "Path Consistency Learning"; Nachum et al. 2018, "Trust-PCL", equation 15.
+    """
+    _check_shapes(reward, value, log_ratio, mask)
+    to_the_end = discounted_return(reward - penalty * log_ratio, discount, mask)
+    if path_steps is None or path_steps >= reward.shape[1]:
+        return to_the_end
+    kept = value if mask is None else torch.where(mask, value, torch.zeros_like(value))
+    after = torch.zeros_like(kept)
+    after[:, :-path_steps] = (kept - to_the_end)[:, path_steps:]
+    result = to_the_end + discount**path_steps * after
+    return result if mask is None else torch.where(mask, result, torch.zeros_like(result))
+
+
 def bootstrapped(reward: Tensor, terminal: Tensor, next_value: Tensor, discount: float) -> Tensor:
     """Return the Bellman target.
 

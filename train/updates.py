@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from graspq.train.batch import Batch
+from graspq.train.distributed import BatchPart
 from graspq.train.networks import Link
 
 if TYPE_CHECKING:
@@ -44,6 +45,8 @@ LINKS: dict[LossName, Link] = {"cross-entropy": "logistic", "squared": "identity
 
 Update = Callable[["TrainState", Batch, "Estimator", "Context"], Tensor]
 """Changes the state by one step on a batch and returns the loss, a float32 scalar without gradient."""
+Objective = Callable[[Batch, "Estimator", "Context"], Tensor]
+"""Returns the mean loss of the context's networks on a batch, a float32 scalar, without changing anything."""
 
 
 def regression(state: "TrainState", batch: Batch, estimator: "Estimator", context: "Context") -> Tensor:
@@ -51,24 +54,39 @@ def regression(state: "TrainState", batch: Batch, estimator: "Estimator", contex
 
     θ ← θ - optimiser(∇_θ mean ℓ(Q_θ(s_t, a_t), y_t)),  y_t fixed
     """
-    state.network.eval()
+    q = state.learned["q"]
+    q.eval()
     target = target_of(batch, estimator, context)
-    state.network.train()
+    q.train()
     loss = loss_of(batch, target, estimator, context)
-    state.optimizer.zero_grad(set_to_none=True)
-    loss.backward()  # type: ignore[no-untyped-call]
-    state.optimizer.step()
+    descend(state.optimizers["q"], loss, context.part)
     return loss.detach()
+
+
+def regression_objective(batch: Batch, estimator: "Estimator", context: "Context") -> Tensor:
+    """Return the mean loss between Q_θ(s, a) and the estimator's target."""
+    return loss_of(batch, target_of(batch, estimator, context), estimator, context)
+
+
+def descend(optimizer: torch.optim.Optimizer, loss: Tensor, part: BatchPart) -> None:
+    """Take the optimiser's step down the gradient of the mean loss of a part of a batch: of all parts, with ranks."""
+    optimizer.zero_grad(set_to_none=True)
+    (loss * part.share).backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
 
 
 def target_of(batch: Batch, estimator: "Estimator", context: "Context") -> Tensor:
     """Return the estimator's target of every real step, float32 [n], without gradient."""
     with torch.no_grad(), context.autocast():
-        return batch.real(estimator.target(batch, context)).float()
+        target = batch.real(estimator.target(batch, context)).float()
+    context.watched["target"] = target.abs().mean()
+    return target
 
 
 def loss_of(batch: Batch, target: Tensor, estimator: "Estimator", context: "Context") -> Tensor:
     """Return the mean loss of the context's network, as it stands, against targets [n]; float32 scalar."""
     with context.autocast():
         output = context.network(batch.real(batch.image), batch.real(batch.step), batch.real(estimator.action(batch)))
-    return LOSSES[context.loss](output.float(), target).mean()
+    output = output.float()
+    context.watched["Q"] = context.network.value_of(output.detach()).abs().mean()
+    return LOSSES[context.loss](output, target).mean()

@@ -15,7 +15,6 @@ import torch
 from graspq.train.batch import Batch
 from graspq.train.estimators import Estimator
 from graspq.train.state import Context
-from graspq.train.updates import loss_of, target_of
 
 Floats = npt.NDArray[np.floating[Any]]
 BINS = 10
@@ -51,27 +50,29 @@ class Validation:
 
 @torch.no_grad()
 def validate(batches: Iterable[Batch], estimator: Estimator, context: Context) -> Validation | None:
-    """Judge the context's network on batches, in evaluation mode; None where there are none."""
-    context.network.eval()
-    total, count = 0.0, 0
+    """Judge the context's networks on batches, in evaluation mode; None where there are none."""
+    for network in context.networks.values():
+        network.eval()
+    total, count, last_steps = 0.0, 0, 0
     scores, rewards = [], []
     for batch in batches:
-        target = target_of(batch, estimator, context)
-        total += float(loss_of(batch, target, estimator, context)) * len(target)
-        count += len(target)
+        size = int(batch.step.numel() if batch.mask is None else batch.mask.sum())
+        total += float(estimator.objective(batch, estimator, context)) * size
+        count += size
         last = batch.real(batch.terminal)
-        with context.autocast():
-            at_last = context.network.at(batch.real(batch.image)[last], batch.real(batch.step)[last])
-            q_at_last = at_last(batch.real(batch.action)[last].unsqueeze(1)).squeeze(1)
-        scores.append(q_at_last.float().cpu().numpy())
-        rewards.append(batch.real(batch.reward)[last].cpu().numpy())
+        last_steps += int(last.sum())
+        if estimator.score is not None:
+            with context.autocast():
+                scores.append(estimator.score(batch, context)[last].float().cpu().numpy())
+            rewards.append(batch.real(batch.reward)[last].cpu().numpy())
     if count == 0:
         return None
-    q, reward = np.concatenate(scores).astype(np.float64), np.concatenate(rewards)
+    q = np.concatenate(scores).astype(np.float64) if scores else np.zeros(0)
+    reward = np.concatenate(rewards) if rewards else np.zeros(0, dtype=np.float32)
     rows, error = calibration(q, reward)
     return Validation(
         transitions=count,
-        last_steps=len(q),
+        last_steps=last_steps,
         loss=total / count,
         loss_last_step=_cross_entropy(q, reward),
         roc_auc_last_step=roc_auc(q, reward > 0.5),

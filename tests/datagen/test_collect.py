@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from graspq.common.seeding import generator, integer_seed
 from graspq.datagen.collect import collect_block
 from graspq.datagen.settings import CollectionSettings
 from graspq.sim.episode import GraspSimulation
@@ -55,6 +56,48 @@ def test_the_reward_stands_on_the_last_row_and_poses_follow_the_actions(alone):
         free = np.abs(poses[:-1, :2] - [0.55, 0]).max(axis=1) < 0.06  # away from the workspace's bounds
         error = np.abs(np.diff(poses, axis=0) - episode.actions * limits)[free]
         assert error[:, :2].max() < 0.008
+
+
+def test_the_random_policy_takes_the_same_draws_as_ever(alone):
+    for episode in alone:
+        assert episode.seed == integer_seed("datagen/episode", SETTINGS.seed, episode.episode_id)
+        draws = generator("datagen/policy", episode.seed)
+        expected = []
+        for _ in range(episode.steps):
+            action = draws.uniform(-1.0, 1.0, size=4)
+            if draws.random() < 0.9:
+                action[2] = -1.0
+            expected.append(action)
+        np.testing.assert_array_equal(episode.actions, np.float32(expected))
+        assert (episode.policy, episode.exploration) == ("random", 0.9)
+
+
+def test_another_policy_sees_image_and_step_and_is_named_and_scenes_stay_the_same(regular_objects, alone):
+    class Watcher:
+        name, exploration = "watcher", 0.25
+
+        def __init__(self):
+            self.seen = []
+
+        def act(self, image, step, draws):
+            self.seen.append((image, step))
+            return np.array([0, 0, -1 if step > 1 else 0, 0], np.float32)
+
+    watcher = Watcher()
+    with GraspSimulation(TASKS["regular"], regular_objects) as simulation:
+        made = collect_block(simulation, SETTINGS, 5, 2, watcher)
+    images = np.concatenate([episode.images for episode in made])
+    np.testing.assert_array_equal(np.stack([image for image, _ in watcher.seen]), images)
+    assert [step for _, step in watcher.seen] == [*range(made[0].steps), *range(made[1].steps)]
+    assert [(episode.policy, episode.exploration) for episode in made] == [("watcher", 0.25)] * 2
+    np.testing.assert_array_equal(made[0].images[0], alone[0].images[0])
+    np.testing.assert_array_equal(made[0].object_poses, alone[0].object_poses)
+
+
+def test_a_block_after_short_ones_can_begin_with_any_episode(regular_objects, alone):
+    with GraspSimulation(TASKS["regular"], regular_objects) as simulation:
+        made = collect_block(simulation, SETTINGS, 5, 2, first_episode=7)
+    assert [episode.episode_id for episode in made] == [7, 8] and made[0].object_ids == alone[0].object_ids
 
 
 def test_another_seed_or_block_gives_other_objects(regular_objects, alone):

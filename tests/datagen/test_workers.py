@@ -15,6 +15,19 @@ def test_every_block_comes_back_once(regular_objects):
     assert all([episode.block for episode in episodes] == [job.block] * 2 for job, episodes in results)
 
 
+def test_this_process_gives_the_episodes_of_a_worker(regular_objects):
+    jobs = [BlockJob(1, 2, first_episode=5)]
+    (_, ours), (_, theirs) = (
+        next(iter(collect_blocks(jobs, TASKS["regular"], regular_objects.folder, SETTINGS, workers=workers)))
+        for workers in (0, 1)
+    )
+    assert [episode.episode_id for episode in ours] == [episode.episode_id for episode in theirs] == [5, 6]
+    assert all(
+        one.images.tobytes() == other.images.tobytes() and one.actions.tobytes() == other.actions.tobytes()
+        for one, other in zip(ours, theirs, strict=True)
+    )
+
+
 def test_a_mistake_of_the_user_in_a_worker_arrives_as_one(regular_objects):
     with pytest.raises(UserError, match="no split"):
         list(collect_blocks([BlockJob(0, 1)], TASKS["targeted"], regular_objects.folder, SETTINGS, workers=1))

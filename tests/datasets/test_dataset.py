@@ -1,10 +1,12 @@
 import dataclasses
 import shutil
 
+import numpy as np
 import pytest
 
 from graspq.common.errors import UserError
 from graspq.datasets.dataset import Dataset, open_shards
+from graspq.datasets.labels import mc_return
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.writer import commit_shard, write_shard
 
@@ -31,6 +33,32 @@ def test_a_short_last_block_has_its_own_number_of_episodes(drawn, tmp_path):
     pool = Dataset.open(tmp_path).pool()
     assert [ref.episodes for ref in pool.blocks] == [3, 3, 1]
     assert len(pool.read_block(pool.blocks[2]).lengths) == 1
+
+
+def test_another_discount_makes_the_returns_anew_and_leaves_all_else_as_it_is(dataset, drawn):
+    pool = open_shards([dataset])
+    halved = pool.with_discount(0.5)
+    assert (halved.discount, pool.discount) == (0.5, 1.0) and pool.with_discount(1.0) is pool
+    training, _ = halved.split(0.2, 0)
+    for ref in training.blocks:
+        stored, made = pool.read_block(ref).records, training.read_block(ref).records
+        expected = np.concatenate([mc_return(episode.rewards, 0.5) for episode in drawn.episodes(ref.block, 1)])
+        assert np.array_equal(made["mc_return"], expected)
+        for name in set(stored.dtype.names) - {"mc_return"}:
+            assert np.array_equal(made[name], stored[name])
+    again = halved.with_discount(1.0)
+    assert np.array_equal(again.read_block(again.blocks[0]).records, pool.read_block(pool.blocks[0]).records)
+
+
+def test_columns_are_read_without_the_others(dataset):
+    pool = open_shards([dataset])
+    block = pool.read_block(pool.blocks[3])
+    columns = pool.read_columns(pool.blocks[3], ("step", "synthetic_action"))
+    assert list(columns) == ["step", "synthetic_action"]
+    assert np.array_equal(columns["step"], block.records["step"])
+    assert np.array_equal(columns["synthetic_action"], block.records["synthetic_action"])
+    with pytest.raises(UserError, match="block 3 cannot be read"):
+        pool.read_columns(pool.blocks[3], ("pose",))
 
 
 @pytest.mark.parametrize(

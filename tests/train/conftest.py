@@ -4,6 +4,7 @@ State A (dark image): an action with dx > 0 leads to state B, any other ends the
 cases. State B (bright image): the episode ends with reward 1 where dx > 0, else 0. Actions are uniform.
 """
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,8 @@ from graspq.datasets.manifest import Manifest
 from graspq.datasets.writer import commit_shard, write_shard
 from graspq.train.settings import TrainSettings, preset_settings
 
+# For `tiny_mdp` and `tiny_training`, which hold no tests.
+sys.path.append(str(Path(__file__).parent))
 SIZE, BLOCK = 16, 10
 GREY = {"A": 60, "B": 190}
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from graspq.common.errors import UserError
-from graspq.train.checkpoint import load_checkpoint, load_policy_network, save_checkpoint
+from graspq.train.checkpoint import load_acting, load_checkpoint, save_checkpoint
 from graspq.train.loop import train
 from graspq.train.networks import NetworkSpecification
 from graspq.train.run import Run
@@ -33,24 +33,27 @@ def flip(path: Path, position: int) -> None:
 def test_a_checkpoint_restores_every_tensor_and_its_layout(settings: Make, run: Run) -> None:
     chosen = settings(steps=2)
     specification = NetworkSpecification.from_json(run.config["network"])
-    state = new_state(specification, chosen, torch.device("cpu"))
+    state = new_state(specification, chosen, torch.device("cpu"), {"q": 1})
     load_checkpoint(run.checkpoint(), state, specification)
     assert state.step == 2
-    fresh = new_state(specification, chosen, torch.device("cpu"))
-    assert not torch.equal(state.network.last.weight, fresh.network.last.weight)  # type: ignore[union-attr, arg-type]
+    fresh = new_state(specification, chosen, torch.device("cpu"), {"q": 1})
+    assert not torch.equal(state.learned["q"].last.weight, fresh.learned["q"].last.weight)  # type: ignore[arg-type]
     again = save_checkpoint(run.folder / "again", state, specification)
     for path in run.checkpoint().iterdir():
         assert path.read_bytes() == (again / path.name).read_bytes(), path.name
-    for (name, ours), theirs in zip(state.network.named_parameters(), fresh.network.parameters(), strict=True):
+    for (name, ours), theirs in zip(
+        state.learned["q"].named_parameters(), fresh.learned["q"].parameters(), strict=True
+    ):
         assert ours.stride() == theirs.stride(), name
-        assert state.optimizer.state[ours]["exp_avg"].stride() == ours.stride(), name
+        assert state.optimizers["q"].state[ours]["exp_avg"].stride() == ours.stride(), name
 
 
 def test_a_policy_gets_the_averaged_network_in_evaluation_mode(run: Run) -> None:
-    network, config = load_policy_network(run.folder)
-    averaged = (run.checkpoint() / "averaged.safetensors").read_bytes()
+    loaded = load_acting(run.folder)
+    network = loaded.networks["q"]
+    averaged = (run.checkpoint() / "averaged-q.safetensors").read_bytes()
     assert not network.training and not any(parameter.requires_grad for parameter in network.parameters())
-    assert config["checkpoint"]["step"] == 2 and config["settings"]["algo"] == "mc"
+    assert loaded.step == 2 and loaded.config["settings"]["algo"] == "mc"
     import safetensors.torch
 
     for name, tensor in safetensors.torch.load(averaged).items():
@@ -60,31 +63,30 @@ def test_a_policy_gets_the_averaged_network_in_evaluation_mode(run: Run) -> None
 def test_a_policy_is_loaded_from_a_run_or_from_one_of_its_checkpoints(settings: Make) -> None:
     run = train(settings(steps=20))
     assert [path.name for path in run.checkpoints()] == ["step-00000010", "step-00000020"]
-    newest, _ = load_policy_network(run.folder)
-    older, config = load_policy_network(run.folder, step=10)
-    same, _ = load_policy_network(run.checkpoints()[0])
-    weight = "last.weight"
-    assert config["checkpoint"]["step"] == 10
-    assert torch.equal(older.state_dict()[weight], same.state_dict()[weight])
-    assert not torch.equal(older.state_dict()[weight], newest.state_dict()[weight])
+    newest, older = load_acting(run.folder), load_acting(run.folder, step=10)
+    same = load_acting(run.checkpoints()[0])
+    first, second, third = (loaded.networks["q"].state_dict()["last.weight"] for loaded in (older, same, newest))
+    assert older.step == same.step == 10 and newest.step == 20
+    assert torch.equal(first, second) and older.sha256 == same.sha256
+    assert not torch.equal(first, third) and older.sha256 != newest.sha256
     with pytest.raises(UserError, match="no checkpoint of step 7, only of 10, 20"):
-        load_policy_network(run.folder, step=7)
+        load_acting(run.folder, step=7)
 
 
-@pytest.mark.parametrize("name", ["averaged.safetensors", "state.json"])
+@pytest.mark.parametrize("name", ["averaged-q.safetensors", "extra.safetensors", "state.json"])
 def test_a_single_flipped_bit_anywhere_is_noticed(run: Run, name: str) -> None:
     path = run.checkpoint() / name
     original = path.read_bytes()
     for position in {0, 5, len(original) // 3, len(original) // 2, len(original) - 2}:
         flip(path, position)
         with pytest.raises(UserError) as error:
-            load_policy_network(run.folder)
+            load_acting(run.folder)
         assert "\n" not in str(error.value) and str(path) in str(error.value)
         path.write_bytes(original)
-    load_policy_network(run.folder)
+    load_acting(run.folder)
 
 
-@pytest.mark.parametrize("name", ["network.safetensors", "lagged.safetensors", "optimizer.safetensors"])
+@pytest.mark.parametrize("name", ["q.safetensors", "lagged-q.safetensors", "optimizer-q.safetensors"])
 def test_training_does_not_go_on_from_a_damaged_checkpoint(settings: Make, run: Run, name: str) -> None:
     flip(run.checkpoint() / name, -1)
     with pytest.raises(UserError, match=rf"{name}: damaged, .* delete this checkpoint's folder"):
@@ -92,13 +94,13 @@ def test_training_does_not_go_on_from_a_damaged_checkpoint(settings: Make, run: 
 
 
 def test_a_truncated_or_missing_file_is_refused(run: Run) -> None:
-    path = run.checkpoint() / "averaged.safetensors"
+    path = run.checkpoint() / "averaged-q.safetensors"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(UserError, match="damaged"):
-        load_policy_network(run.folder)
+        load_acting(run.folder)
     path.unlink()
     with pytest.raises(UserError, match="cannot be read"):
-        load_policy_network(run.folder)
+        load_acting(run.folder)
 
 
 def test_a_checkpoint_of_another_network_is_refused(settings: Make, run: Run, tmp_path: Path) -> None:
@@ -106,7 +108,7 @@ def test_a_checkpoint_of_another_network_is_refused(settings: Make, run: Run, tm
     shutil.rmtree(run.checkpoint())
     shutil.copytree(other.checkpoint(), run.checkpoints_folder / "step-00000002")
     with pytest.raises(UserError, match="of another network than its run"):
-        load_policy_network(run.folder)
+        load_acting(run.folder)
     with pytest.raises(UserError, match="of another network: expected"):
         train(settings(steps=2))
 
@@ -115,14 +117,16 @@ def test_weights_of_another_network_are_refused_even_with_a_fitting_digest(setti
     run = train(settings(steps=2))
     specification = NetworkSpecification.from_json(run.config["network"])
     other = NetworkSpecification("paper", *list(run.config["network"].values())[1:])
-    save_checkpoint(run.folder / "checkpoints", new_state(other, settings(), torch.device("cpu")), specification)
+    save_checkpoint(
+        run.folder / "checkpoints", new_state(other, settings(), torch.device("cpu"), {"q": 1}), specification
+    )
     with pytest.raises(UserError, match=r"action\.weight should be absent, is \[33, 4\]"):
-        load_policy_network(run.folder, step=0)
+        load_acting(run.folder, step=0)
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no training run"):
-        load_policy_network(tmp_path / "nothing")
+        load_acting(tmp_path / "nothing")
     (tmp_path / "config.json").write_text(json.dumps({"settings": {}}))
     with pytest.raises(UserError, match="no checkpoint yet"):
-        load_policy_network(tmp_path)
+        load_acting(tmp_path)

@@ -1,6 +1,9 @@
 """The table of estimators, and the double-Q target on Q-functions whose values are known."""
 
 import contextlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,8 +12,10 @@ from torch import Tensor
 from graspq.common.errors import UserError
 from graspq.train.batch import Batch
 from graspq.train.estimators import ESTIMATORS, as_markdown, estimator_named
+from graspq.train.loop import train
 from graspq.train.networks import Features, QNetwork
 from graspq.train.selection import uniform_actions
+from graspq.train.settings import TrainSettings
 from graspq.train.state import Context, seeded
 from graspq.train.updates import cross_entropy, squared
 
@@ -33,7 +38,17 @@ class Slope(QNetwork):
 
 
 def context(network: QNetwork, lagged: QNetwork) -> Context:
-    return Context(network, lagged, "squared", 0.9, 16, seeded("tests/draws"), 0.0, contextlib.nullcontext)
+    return Context(
+        networks={"q": network},
+        lagged_networks={"q": lagged},
+        loss="squared",
+        discount=0.9,
+        candidates=16,
+        generator=seeded("tests/draws"),
+        progress=0.0,
+        autocast=contextlib.nullcontext,
+        extra={},
+    )
 
 
 def batch() -> Batch:
@@ -66,26 +81,68 @@ def test_the_monte_carlo_target_is_the_observed_return() -> None:
 
 
 def test_the_table_has_the_papers_words() -> None:
-    assert as_markdown().splitlines() == [
+    assert as_markdown().splitlines()[:8] == [
         "| `--algo` | target value | action selection |",
         "|---|---|---|",
+        "| `supervised` | episode value, on synthetic actions | stochastic search |",
         "| `dql` | bootstrapped (double Q, lagged target network) | stochastic search |",
         "| `mc` | episode value | stochastic search |",
+        "| `corr-mc` | corrected episode value, coefficient nu annealed 0 -> 1 | stochastic search |",
+        "| `ddpg` | bootstrapped | actor network |",
+        "| `pcl` | corrected episode value (Trust-PCL: relative entropy to a lagged policy) | actor network |",
     ]
 
 
 def test_an_unknown_estimator_is_refused_with_the_choices() -> None:
-    with pytest.raises(UserError, match="'sarsa' is unknown; choose from dql, mc"):
+    with pytest.raises(UserError, match=r"'sarsa' is unknown; choose from supervised, dql, mc, .*, or module:row"):
         estimator_named("sarsa")
 
 
-def test_bootstrapped_targets_take_a_discount_and_observed_returns_only_their_own() -> None:
+OWN_ROW = """
+import dataclasses
+from graspq.train.estimators import ESTIMATORS
+lazy = dataclasses.replace(ESTIMATORS["mc"], summary="Half of the return", target=lambda b, c: 0.5 * b.mc_return)
+wrong = "mc"
+"""
+
+
+def test_a_users_own_row_is_found_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_estimators.py").write_text(OWN_ROW)
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    row = estimator_named("own_estimators:lazy")
+    assert row.summary == "Half of the return" and sys.path == before
+    assert torch.equal(row.target(batch(), context(Slope(1), Slope(1))), 0.5 * batch().mc_return)
+    with pytest.raises(UserError, match="own_estimators has str 'wrong'"):
+        estimator_named("own_estimators:wrong")
+    with pytest.raises(UserError, match="own_estimators has NoneType 'none'"):
+        estimator_named("own_estimators:none")
+    with pytest.raises(UserError, match=r"absent_estimators:row: cannot be imported .ModuleNotFoundError"):
+        estimator_named("absent_estimators:row")
+
+
+def test_a_users_own_row_trains_and_its_run_acts(
+    settings: Callable[..., TrainSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trained_estimators.py").write_text(OWN_ROW)
+    monkeypatch.chdir(tmp_path)
+    run = train(settings("trained_estimators:lazy", steps=2))
+    assert run.config["settings"]["algo"] == "trained_estimators:lazy"
+    assert run.checkpoint().name == "step-00000002"
+    named = settings("trained_estimators:lazy", out=None).run_folder
+    assert named == Path("runs/trained_estimators-lazy-two-states-seed0")
+
+
+def test_discounts_are_the_rows_own_the_datasets_or_those_given() -> None:
     assert ESTIMATORS["dql"].chosen_discount(None, 1.0) == 0.9
     assert ESTIMATORS["dql"].chosen_discount(0.0, 1.0) == 0.0
+    assert ESTIMATORS["corr-mc"].chosen_discount(None, 1.0) == 0.9
     assert ESTIMATORS["mc"].chosen_discount(None, 1.0) == 1.0
-    assert ESTIMATORS["mc"].chosen_discount(0.95, 0.95) == 0.95
-    with pytest.raises(UserError, match="--discount"):
-        ESTIMATORS["mc"].chosen_discount(0.0, 1.0)
+    assert ESTIMATORS["mc"].chosen_discount(None, 0.95) == 0.95
+    assert ESTIMATORS["mc"].chosen_discount(0.0, 1.0) == 0.0
+    assert ESTIMATORS["supervised"].chosen_discount(None, 0.95) == 1.0
+    with pytest.raises(UserError, match=r"--discount: .* have no discount, got 1; leave the option out"):
+        ESTIMATORS["supervised"].chosen_discount(1.0, 1.0)
 
 
 @pytest.mark.parametrize("loss", [cross_entropy, squared])

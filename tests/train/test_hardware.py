@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 
 from graspq.common.errors import UserError
-from graspq.train.hardware import chosen_device, chosen_precision, keep_freed_memory
+from graspq.train.hardware import (
+    Precision,
+    _faster_compiled,
+    chosen_compilation,
+    chosen_device,
+    chosen_precision,
+    compile_networks,
+    keep_freed_memory,
+)
 from graspq.train.networks import NetworkSpecification, make_network
 from graspq.train.state import seeded
 
@@ -56,3 +64,31 @@ def test_a_gpu_that_is_not_there_is_refused() -> None:
 def test_keeping_freed_memory_does_no_harm() -> None:
     keep_freed_memory()
     assert float(torch.ones(1_000_000).sum()) == 1_000_000
+
+
+def test_a_compiled_network_gives_the_same_q_and_keeps_the_names_of_its_weights() -> None:
+    plain = make_network(SPECIFICATION, seeded("tests/weights"))
+    compiled = copy.deepcopy(plain)
+    compile_networks([compiled], backend="eager")
+    image = torch.randint(0, 256, (3, 16, 16, 3), dtype=torch.uint8, generator=seeded("tests/images"))
+    state = image, torch.tensor([0, 1, 2])
+    action = torch.rand(3, 5, 4, generator=seeded("tests/actions")) * 2 - 1
+    with torch.no_grad():
+        torch.testing.assert_close(compiled.eval().at(*state)(action), plain.eval().at(*state)(action))
+    assert list(compiled.state_dict()) == list(plain.state_dict())
+
+
+def test_on_a_cpu_networks_are_compiled_only_where_asked() -> None:
+    network, precision = make_network(SPECIFICATION, seeded("tests/weights")), Precision("float32", torch.device("cpu"))
+    answers = [chosen_compilation(asked, network, precision, (16, 16, 3))[0] for asked in ("auto", "yes", "no")]
+    assert answers == [False, True, False]
+
+
+def test_a_compiler_that_fails_is_not_taken_and_the_reason_is_kept() -> None:
+    network, precision = make_network(SPECIFICATION, seeded("tests/weights")), Precision("float32", torch.device("cpu"))
+
+    def broken(graph: object, inputs: object) -> object:
+        raise RuntimeError("no compiler here")
+
+    taken, probe = _faster_compiled(network, precision, (16, 16, 3), broken)  # type: ignore[arg-type]
+    assert not taken and "no compiler here" in probe["failed"]

@@ -16,7 +16,8 @@ import torch
 
 from graspq.common.errors import UserError
 from graspq.train import loop
-from graspq.train.checkpoint import load_policy_network
+from graspq.train.checkpoint import load_acting
+from graspq.train.estimators import ESTIMATORS
 from graspq.train.loop import DivergedError, train
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
@@ -30,7 +31,7 @@ def same_checkpoints(first: Path, second: Path) -> bool:
     return all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
 
 
-@pytest.mark.parametrize("algo", ["mc", "dql"])
+@pytest.mark.parametrize("algo", ESTIMATORS)
 def test_twenty_steps_equal_ten_steps_a_checkpoint_and_ten_steps_bit_by_bit(
     settings: Make, tmp_path: Path, algo: str
 ) -> None:
@@ -138,9 +139,24 @@ def test_two_trainings_do_not_share_a_folder(settings: Make) -> None:
         train(settings(steps=2))
 
 
-def test_a_discount_that_the_returns_were_not_made_with_is_refused_for_mc(settings: Make) -> None:
-    with pytest.raises(UserError, match="--discount"):
-        train(settings("mc", discount=0.5))
+def test_another_discount_makes_the_returns_of_mc_anew_and_says_so(
+    settings: Make, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = train(settings("mc", discount=0.5, steps=2)).config
+    assert config["discount"] == 0.5 and config["dataset"]["discount"] == 1.0
+    assert config["mc_return"] == "made from the rewards with discount 0.5"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "mc: returns are made from the rewards with discount 0.5; the data's are of discount 1"
+
+
+def test_the_datasets_own_discount_needs_no_word(settings: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train(settings("mc", steps=2)).config["mc_return"] == "as stored"
+    assert capsys.readouterr().err == ""
+
+
+def test_a_discount_for_supervised_is_refused(settings: Make) -> None:
+    with pytest.raises(UserError, match="--discount: .* have no discount, got 0.9"):
+        train(settings("supervised", discount=0.9))
 
 
 def test_divergence_stops_with_estimator_step_quantity_and_the_last_good_checkpoint(settings: Make) -> None:
@@ -154,18 +170,18 @@ def test_the_step_of_a_loss_that_is_not_finite_is_named_and_the_checkpoint_befor
     chosen = settings(steps=30, checkpoint_every=3, log_every=100)
     run = train(chosen, stop_at=3)
 
-    class Poisoned(loop._Session):
-        def _update(self, batch: loop.Batch) -> torch.Tensor:
-            loss = super()._update(batch)
+    class Poisoned(loop.Session):
+        def _update(self, batch: loop.Batch, part: loop.BatchPart) -> torch.Tensor:
+            loss = super()._update(batch, part)
             return loss * torch.nan if self.state.step == 5 else loss
 
-    original = loop._Session
-    loop._Session = Poisoned  # type: ignore[misc]
+    original = loop.Session
+    loop.Session = Poisoned  # type: ignore[misc]
     try:
         with pytest.raises(DivergedError, match=r"mc diverged at step 5: the loss is not finite; .*step-00000003 is"):
             train(chosen)
     finally:
-        loop._Session = original  # type: ignore[misc]
+        loop.Session = original  # type: ignore[misc]
     assert run.latest_checkpoint() == run.folder / "checkpoints/step-00000003"
 
 
@@ -214,7 +230,7 @@ def test_a_run_that_is_killed_or_interrupted_keeps_a_checkpoint_that_loads(setti
         for process in processes:
             process.kill()
     for chosen in (killed, interrupted):
-        assert load_policy_network(chosen.run_folder)[1]["checkpoint"]["step"] >= 10
+        assert load_acting(chosen.run_folder).step >= 10
     assert processes[1].returncode == 130
     assert errors[1].strip().splitlines()[-1] == "interrupted" and "Traceback" not in errors[1]
     run = Run.open(interrupted.run_folder)

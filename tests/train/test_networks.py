@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from graspq.common.errors import UserError
-from graspq.train.networks import NETWORKS, NetworkSpecification, QNetwork, make_network
+from graspq.train.default_network import DefaultNetwork
+from graspq.train.networks import NETWORKS, NetworkSpecification, QNetwork, make_network, make_state_network
 from graspq.train.paper_network import PaperNetwork
 from graspq.train.state import seeded
 
@@ -60,7 +61,7 @@ def test_the_paper_network_equals_its_unsplit_form() -> None:
     network = made("paper")
     assert isinstance(network, PaperNetwork)
     image, step, action = states()
-    state_map = network.state_map(image, step)
+    state_map = network.map(image, step)
     assert state_map.shape == (BATCH, 33, 7, 7)
     for index in range(CANDIDATES):
         embedding = network.action_norm(network.action(action[:, index]))
@@ -75,9 +76,9 @@ def test_the_paper_network_has_the_papers_sizes() -> None:
     network = make_network(specification("paper"), seeded("tests/weights"))
     shapes = {name: list(value.shape) for name, value in network.named_parameters() if value.dim() > 1}
     assert shapes == {
-        "convolutions.0.weight": [32, 3, 3, 3],
-        "convolutions.1.weight": [32, 32, 3, 3],
-        "convolutions.2.weight": [32, 32, 3, 3],
+        "map.convolutions.0.weight": [32, 3, 3, 3],
+        "map.convolutions.1.weight": [32, 32, 3, 3],
+        "map.convolutions.2.weight": [32, 32, 3, 3],
         "action.weight": [33, 4],
         "first.weight": [32, 33 * 7 * 7],
         "second.weight": [32, 32],
@@ -94,7 +95,7 @@ def test_layer_normalisation_of_the_paper_network_is_over_height_width_and_chann
     assert isinstance(network, PaperNetwork)
     x = torch.rand(2, 32, 5, 5, generator=seeded("tests/x"))
     expected = functional.relu(functional.layer_norm(x, [32, 5, 5], eps=1e-12))
-    torch.testing.assert_close(network.convolution_norms[0](x), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(network.map.norms[0](x), expected, rtol=1e-5, atol=1e-5)
 
 
 @torch.no_grad()
@@ -152,3 +153,58 @@ def test_images_that_a_network_cannot_take_are_refused_in_one_line(name: str, si
 def test_an_unknown_network_is_refused_with_the_choices() -> None:
     with pytest.raises(UserError, match="choose from default, paper"):
         make_network(specification("resnet"))
+
+
+@torch.no_grad()
+def test_keypoints_are_the_expected_positions_of_their_heat() -> None:
+    network = made("default")
+    assert isinstance(network, DefaultNetwork)
+    keypoints = network.encoder.keypoints
+    x = torch.zeros(1, 64, 16, 16)
+    x[0, 0, 3, 12] = 1.0
+    keypoints.heat.weight.zero_()
+    keypoints.heat.weight[:, 0] = 1e4
+    points = keypoints(x).view(-1, 2)
+    expected = torch.tensor([12 / 15 * 2 - 1, 3 / 15 * 2 - 1]).expand(16, 2)
+    torch.testing.assert_close(points, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(keypoints(torch.zeros_like(x)), torch.zeros(1, 32), rtol=0, atol=1e-6)
+
+
+@torch.no_grad()
+def test_a_look_reads_the_map_where_the_action_leads() -> None:
+    network = made("default")
+    assert isinstance(network, DefaultNetwork)
+    network.displacement.weight.zero_()
+    network.displacement.weight[0, 0] = 2 / 15  # dx of 1 moves the first look by one pixel of the map
+    network.looks_to_hidden.weight.zero_()
+    network.looks_to_hidden.weight[:, 0] = 1.0
+    network.action_to_hidden.weight.zero_()
+    state, where = torch.zeros(1, 256), torch.zeros(1, 8)
+    where[0, :2] = torch.tensor([5 / 15 * 2 - 1, 9 / 15 * 2 - 1])
+    local = torch.zeros(1, 32, 16, 16)
+    local[0, 0, 9, 6] = 3.0
+
+    def seen(dx: float) -> float:
+        """The feature of the first look, recovered from the output, in which it is piecewise linear."""
+        return float(network.head((state, where, local), torch.tensor([[[dx, 0.0, 0.0, 0.0]]])))
+
+    network.hidden.weight.fill_(1 / 256)
+    network.hidden.bias.zero_()
+    network.last.weight.fill_(1 / 128)
+    network.last.bias.zero_()
+    assert [seen(dx) for dx in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([0.0, 1.5, 3.0, 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("name", list(NETWORKS))
+def test_a_function_of_the_state_has_the_asked_outputs_and_reads_image_and_step(name: str) -> None:
+    network = make_state_network(specification(name), 8, seeded("tests/weights"))
+    generator = seeded("tests/shake")
+    for parameter in network.parameters():
+        parameter.data += 0.1 * (torch.rand(parameter.shape, generator=generator) - 0.5)
+    image, step, _ = states()
+    with torch.no_grad():
+        outputs = network.eval()(image, step)
+        later = network(image, (step + 5).clamp(max=14))
+    assert outputs.shape == (BATCH, 8) and outputs.dtype == torch.float32
+    assert float(outputs.std(dim=0).min()) > 1e-4
+    assert float((outputs[:2] - later[:2]).abs().max()) > 1e-4 and torch.equal(outputs[2], later[2])

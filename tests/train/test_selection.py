@@ -4,7 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspq.train.selection import cem_noise, cross_entropy_method, uniform_actions, uniform_search
+from graspq.train.selection import (
+    SearchSpace,
+    cem_noise,
+    cross_entropy_method,
+    one_step_of,
+    uniform_actions,
+    uniform_search,
+)
 from graspq.train.state import seeded
 
 # Within reach of where the search starts, dz = -1.
@@ -92,6 +99,30 @@ def test_uniform_search_returns_the_best_candidate_and_its_q() -> None:
     choice = uniform_search(quadratic, candidates)
     assert torch.equal(choice.q, quadratic(candidates).amax(1))
     assert torch.equal(quadratic(choice.action.unsqueeze(1)).squeeze(1), choice.q)
+
+
+def test_the_search_stays_in_the_box_it_is_given_and_starts_where_it_says() -> None:
+    seen: list[Tensor] = []
+    low, high = torch.tensor([[-3.0, -1, -5, 0], [2, 2, 2, 2]]), torch.tensor([[3.0, 1, -4, 0], [2.5, 4, 4, 4]])
+    space = SearchSpace(mean=(low + high) / 2, deviation=torch.tensor([[9.0], [0.01]]), low=low, high=high)
+
+    def remembered(action: Tensor) -> Tensor:
+        seen.append(action)
+        return -(action - 2.2).square().sum(-1)
+
+    choice = cross_entropy_method(remembered, cem_noise(seeded("tests/cem"), batch=2, iterations=4), space=space)
+    for action in [*seen, choice.action.unsqueeze(1)]:
+        assert bool(((action >= low.unsqueeze(1)) & (action <= high.unsqueeze(1))).all())
+    assert float(seen[0][1, :, 1:].std(0).amax()) < 0.02
+    torch.testing.assert_close(seen[0][1].mean(0), torch.tensor([2.25, 3, 3, 3]), rtol=0, atol=0.01)
+    torch.testing.assert_close(choice.action[0], torch.tensor([2.2, 1, -4, 0]), rtol=0, atol=0.2)
+
+
+def test_a_step_of_a_motion_is_scaled_along_its_line_or_clipped_and_a_short_motion_is_one_step() -> None:
+    motion = torch.tensor([[1.0, -2.0, -4.0, 0.5], [0.1, 0.0, -0.9, 1.0]])
+    scaled, clipped = one_step_of(motion, "scale"), one_step_of(motion, "clip")
+    assert torch.equal(scaled, torch.tensor([[0.25, -0.5, -1.0, 0.125], [0.1, 0.0, -0.9, 1.0]]))
+    assert torch.equal(clipped, torch.tensor([[1.0, -1.0, -1.0, 0.5], [0.1, 0.0, -0.9, 1.0]]))
 
 
 @pytest.mark.parametrize("elites", [1, 65])

@@ -55,7 +55,7 @@ def test_settings_survive_json() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"algo": "sarsa"}, "'sarsa' is unknown; choose from dql, mc"),
+        ({"algo": "sarsa"}, "'sarsa' is unknown; choose from supervised, dql, mc"),
         ({"batch_size": 1}, "--batch-size: expected a number of at least 2, got 1"),
         ({"network": "resnet"}, "'resnet' is unknown"),
         ({"loss": "hinge"}, "'hinge' is unknown"),

@@ -2,8 +2,10 @@
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from graspq.train.targets import bootstrapped, discounted_return, episode_value
+from graspq.train.targets import bootstrapped, corrected_episode_value, discounted_return, episode_value
 
 REWARD = torch.tensor([[0.0, 0.0, 1.0], [0.5, -1.0, 2.0]], dtype=torch.float64)
 LAST = torch.tensor([[False, False, True], [False, False, True]])
@@ -30,9 +32,79 @@ def test_bootstrapped_equals_episode_value_when_v_is_the_observed_return_to_go(d
     torch.testing.assert_close(target, episode_value(returns), rtol=0, atol=1e-15)
 
 
+@st.composite
+def paths(draw: st.DrawFn) -> dict[str, torch.Tensor]:
+    """Draw Q of the logged actions and V ≥ Q along paths of 1 to 6 steps in padded batches, and rewards."""
+    batch, steps = draw(st.integers(1, 3)), draw(st.integers(1, 6))
+    lengths = draw(st.lists(st.integers(1, steps), min_size=batch, max_size=batch))
+    mask = torch.arange(steps) < torch.tensor(lengths).unsqueeze(1)
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    q, worse, reward = (torch.randn(batch, steps, generator=generator, dtype=torch.float64) for _ in range(3))
+    last = mask & ~torch.cat([mask[:, 1:], torch.zeros_like(mask[:, :1])], dim=1)
+    return {"q": q, "value": q + worse.abs(), "reward": reward, "mask": mask, "last": last}
+
+
+discounts = st.floats(0, 1)
+
+
+@given(paths(), discounts, st.floats(0, 1))
+def test_the_recursion_of_the_corrected_value_equals_its_explicit_sum(
+    path: dict[str, torch.Tensor], discount: float, nu: float
+) -> None:
+    advantage, mask = path["q"] - path["value"], path["mask"]
+    result = corrected_episode_value(path["reward"], advantage, nu, discount, mask)
+    for row, length in enumerate(mask.sum(1).tolist()):
+        for t in range(length):
+            explicit = float(path["reward"][row, t])
+            for k in range(t + 1, length):
+                explicit += discount ** (k - t) * float(path["reward"][row, k] - nu * advantage[row, k])
+            assert result[row, t].item() == pytest.approx(explicit, abs=1e-12)
+
+
+@given(paths(), discounts)
+def test_corrected_equals_episode_value_when_the_logged_actions_are_greedy_or_nu_is_zero(
+    path: dict[str, torch.Tensor], discount: float
+) -> None:
+    returns = episode_value(discounted_return(path["reward"], discount, path["mask"]))
+    greedy = corrected_episode_value(path["reward"], torch.zeros_like(path["q"]), 1.0, discount, path["mask"])
+    uncorrected = corrected_episode_value(path["reward"], path["q"] - path["value"], 0.0, discount, path["mask"])
+    torch.testing.assert_close(greedy, returns, rtol=0, atol=1e-14)
+    torch.testing.assert_close(uncorrected, returns, rtol=0, atol=1e-14)
+
+
+@given(paths(), discounts)
+def test_corrected_equals_bootstrapped_when_q_is_bellman_consistent_along_the_path(
+    path: dict[str, torch.Tensor], discount: float
+) -> None:
+    """Q_t = r_t + γ V_{t+1}, and Q_T = r_T: then both are Q itself."""
+    value = path["value"]
+    q = bootstrapped(path["reward"], path["last"], next_values(value), discount)
+    corrected = corrected_episode_value(path["reward"], q - value, 1.0, discount, path["mask"])
+    torch.testing.assert_close(corrected[path["mask"]], q[path["mask"]], rtol=0, atol=1e-12)
+
+
+@given(paths())
+def test_one_step_of_the_corrected_recursion_is_a_bootstrap_from_the_corrected_value(
+    path: dict[str, torch.Tensor],
+) -> None:
+    """y_t = r_t + γ (y_{t+1} - ν A_{t+1}) is the Bellman target for V_{t+1} = y_{t+1} - ν A_{t+1}."""
+    advantage = path["q"] - path["value"]
+    corrected = corrected_episode_value(path["reward"], advantage, 0.7, 0.9, path["mask"])
+    again = bootstrapped(path["reward"], path["last"], next_values(corrected - 0.7 * advantage), 0.9)
+    torch.testing.assert_close(corrected[path["mask"]], again[path["mask"]], rtol=0, atol=1e-12)
+
+
+def test_the_correction_raises_returns_after_bad_actions_beyond_one_and_is_not_clipped() -> None:
+    reward = torch.tensor([[0.0, 0.0, 1.0]])
+    advantage = torch.tensor([[torch.nan, -0.5, -0.25]])
+    corrected = corrected_episode_value(reward, advantage, 1.0, 1.0)
+    assert torch.equal(corrected, torch.tensor([[1.75, 1.25, 1.0]]))
+
+
 def test_all_targets_are_the_reward_at_discount_zero() -> None:
     values = torch.tensor([[3.0, 5.0, 7.0], [2.0, 4.0, 6.0]], dtype=torch.float64)
     assert torch.equal(bootstrapped(REWARD, LAST, values, 0.0), REWARD)
+    assert torch.equal(corrected_episode_value(REWARD, -values, 1.0, 0.0), REWARD)
     assert torch.equal(episode_value(discounted_return(REWARD, 0.0)), REWARD)
 
 
@@ -40,6 +112,7 @@ def test_all_targets_are_the_reward_at_the_last_step() -> None:
     values = torch.full_like(REWARD, torch.nan)
     assert torch.equal(bootstrapped(REWARD, LAST, values, 0.9)[:, -1], REWARD[:, -1])
     assert torch.equal(episode_value(discounted_return(REWARD, 0.9))[:, -1], REWARD[:, -1])
+    assert torch.equal(corrected_episode_value(REWARD, -REWARD.abs(), 1.0, 0.9)[:, -1], REWARD[:, -1])
 
 
 def test_single_transitions_are_episodes_of_one_step() -> None:

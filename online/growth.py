@@ -1,0 +1,186 @@
+"""The growing dataset of an on-policy run: one shard for each round, written once, as `grasp-datagen` writes its own.
+
+Which episodes a round has is a function of seed, round and the weights that act: a round that was killed is collected
+again, one that is in the manifest never is.
+"""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from graspq.common.errors import UserError
+from graspq.common.files import writable_folder
+from graspq.common.machine import available_cores
+from graspq.common.provenance import versions
+from graspq.common.seeding import integer_seed
+from graspq.datagen.plan import check_disk
+from graspq.datagen.run import VERSIONS
+from graspq.datagen.settings import CollectionSettings
+from graspq.datagen.workers import BlockJob, PolicyMaker, collect_blocks
+from graspq.datasets.blocks import BlockRef
+from graspq.datasets.card import write_card
+from graspq.datasets.dataset import Dataset, ShardPool
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
+from graspq.objects.object_set import ObjectSet
+from graspq.online.plan import Plan
+from graspq.sim.task import TaskSettings
+
+DATASET = "dataset"
+
+
+def collection_settings(plan: Plan) -> CollectionSettings:
+    """Return what determines the scenes of all rounds; they share none with a dataset of the same seed."""
+    settings = CollectionSettings(
+        seed=integer_seed("online/collection", plan.train.seed),
+        descend_probability=plan.online.descend_probability,
+        policy=plan.train.algo,
+    )
+    return dataclasses.replace(settings, blocks_per_shard=math.ceil(plan.online.grasps / settings.block_size))
+
+
+def round_jobs(settings: CollectionSettings, grasps: int, number: int) -> list[BlockJob]:
+    """Return the blocks of round `number`, from 0: whole ones, and a short last one where there is a rest."""
+    size, blocks = settings.block_size, settings.blocks_per_shard
+    return [
+        BlockJob(number * blocks + index, min(size, grasps - index * size), number * grasps + index * size)
+        for index in range(blocks)
+    ]
+
+
+@dataclasses.dataclass
+class GrowingDataset:
+    """The dataset folder of a run, with the rounds that are finished.
+
+    Attributes:
+        folder: of the dataset.
+        manifest: as saved.
+        task: of the run.
+        collection: what determines the scenes.
+        grasps: of a round.
+        workers: processes that simulate.
+        blocks: of each finished round.
+    """
+
+    folder: Path
+    manifest: Manifest
+    task: TaskSettings
+    collection: CollectionSettings
+    grasps: int
+    workers: int
+    blocks: list[tuple[BlockRef, ...]]
+
+    @classmethod
+    def open(cls, run: Path, plan: Plan, task: TaskSettings, objects: ObjectSet, pool: ShardPool) -> "GrowingDataset":
+        """Return the dataset of the run in folder `run`, begun where there is none; finished rounds are verified.
+
+        Args:
+            run: folder of the run, which the caller has locked.
+            plan: of the run.
+            task: of the base pool.
+            objects: that fill the bins.
+            pool: the base pool; its discount is taken over.
+
+        Raises:
+            UserError: what is there was made otherwise or is damaged, or the disk is too full.
+        """
+        folder, collection = run / DATASET, collection_settings(plan)
+        fresh = _description(plan, task, objects, collection, pool.discount)
+        writable_folder(folder, "dataset")
+        remove_leftovers(folder)
+        manifest = Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else fresh
+        _require_same(folder, manifest, fresh)
+        check_disk(folder, plan.online.rounds * plan.online.grasps - manifest.episodes)
+        objects.copy_to(folder / "objects")
+        manifest.save(folder)
+        workers = plan.online.workers if plan.online.workers is not None else available_cores()
+        growing = cls(folder, manifest, task, collection, plan.online.grasps, workers, [])
+        for number, entry in enumerate(manifest.shards):
+            growing._require_round(number, entry)
+            growing._take_up(entry)
+        if manifest.shards:
+            growing.manifest = write_card(folder, manifest)  # a killed writer may have left the one of the round before
+        return growing
+
+    def collect(self, number: int, make_policy: PolicyMaker) -> ShardEntry:
+        """Return the shard of round `number`, from 0, which is collected and committed if it is not there.
+
+        Args:
+            number: at most the number of finished rounds.
+            make_policy: who acts.
+
+        Raises:
+            UserError: a block killed its worker twice, or the disk is full.
+        """
+        if number < len(self.blocks):
+            return self.manifest.shards[number]
+        jobs = round_jobs(self.collection, self.grasps, number)
+        team = min(self.workers, len(jobs))
+        with _threads_kept():
+            found = collect_blocks(jobs, self.task, self.folder / "objects", self.collection, team, make_policy)
+            by_block = {job.block: episodes for job, episodes in found}
+        episodes = [episode for job in jobs for episode in by_block[job.block]]
+        entry = write_shard(self.folder, self.manifest, jobs[0].block, len(jobs), episodes)
+        self.manifest = write_card(self.folder, commit_shard(self.folder, self.manifest, entry))
+        self._take_up(entry)
+        return entry
+
+    def blocks_of(self, rounds: int) -> tuple[BlockRef, ...]:
+        """Return the blocks of the first `rounds` rounds, in order."""
+        return tuple(ref for blocks in self.blocks[:rounds] for ref in blocks)
+
+    def _take_up(self, entry: ShardEntry) -> None:
+        self.blocks.append(Dataset(self.folder, self.manifest).shard_pool(entry).blocks)
+
+    def _require_round(self, number: int, entry: ShardEntry) -> None:
+        first = number * self.collection.blocks_per_shard
+        if (entry.first_block, entry.episodes) != (first, self.grasps):
+            raise UserError(
+                f"{self.folder}: {entry.name} is not round {number + 1}, which has {self.grasps} grasps from block "
+                f"{first} on; choose another run folder with --out"
+            )
+
+
+@contextlib.contextmanager
+def _threads_kept() -> Iterator[None]:
+    """Give training its threads back: a policy that acts in this process takes one."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _description(
+    plan: Plan, task: TaskSettings, objects: ObjectSet, collection: CollectionSettings, discount: float
+) -> Manifest:
+    """Return the manifest of the dataset before its first round."""
+    online: dict[str, Any] = plan.described() | {"algo": plan.train.algo, "seed": plan.train.seed}
+    return Manifest(
+        task=task.to_json(),
+        settings=collection.described() | {"online": online},
+        versions=versions(*VERSIONS, "torch"),
+        object_set={"name": objects.name, "sha256": objects.digest()},
+        image_shape=(task.image_size, task.image_size, 3),
+        action_limits=task.action_limits,
+        discount=discount,
+        phi_range=(-task.phi_limit, task.phi_limit),
+    )
+
+
+def _require_same(folder: Path, existing: Manifest, fresh: Manifest) -> None:
+    """Refuse to grow a dataset that was made differently."""
+    for name in ("task", "settings", "versions", "object_set", "discount"):
+        what, there, here = name, getattr(existing, name), getattr(fresh, name)
+        while isinstance(there, dict) and isinstance(here, dict) and there != here:
+            key = next(key for key in {**there, **here} if there.get(key) != here.get(key))
+            what, there, here = f"{what}.{key}", there.get(key), here.get(key)
+        if there != here:
+            raise UserError(
+                f"{folder}: holds grasps made with {what} = {there}, not {here}; choose another run folder with --out"
+            )

@@ -1,0 +1,141 @@
+"""Settings of `grasp-online`: those of the rounds, and with them all of `grasp-train`'s.
+
+`OnlineOptions` is what a command line gives; `plan.resolve` makes complete settings of it.
+"""
+
+import dataclasses
+import typing
+from pathlib import Path
+from typing import Any
+
+from graspq.common.options import Settings, parse_count, setting
+from graspq.evaluate.settings import CemSettings
+from graspq.train.selection import Answer
+from graspq.train.settings import TrainOptions, TrainSettings
+
+# They may differ when a run is resumed: they do not decide what is collected.
+FREE_SETTINGS = frozenset({"start", "checkpoint", "workers", "objects"})
+
+_HELP = {
+    "algo": "Estimator; that of the start run where it is not given.",
+    "shards": "Base pool: dataset folders, shard files or globs; those of the start run where not given.",
+    "out": "Run folder; runs/online-ALGO-DATASET-seedSEED where it is not given.",
+    "seed": "Seed of weights, order, augmentation, candidates, scenes and exploration; 0, or the start run's.",
+    "learning_rate": (
+        "Highest learning rate of AdamW; with --start that run's where its schedule was constant, else a tenth of it."
+    ),
+    "schedule": "Learning rate after warming up; constant where it is not given; cosine falls to 0 at the last round.",
+    "warmup": (
+        "Part of all steps in which the learning rate rises linearly, 0 to 1; 0 with --start, else the preset's."
+    ),
+    "anneal": (
+        "Part of all steps over which the correction of corr-mc rises from 0 to 1; 0, that is all at once, with "
+        "--start, else the preset's."
+    ),
+}
+# Of the run that is gone on from, not to be changed on the way.
+FIXED_BY_START = ("algo", "preset", "network", "width", "loss")
+
+
+@dataclasses.dataclass(frozen=True)
+class OnlineSettings(Settings):
+    """What `grasp-online` has beside the settings of training; see each field's help.
+
+    Source: Quillen et al. 2018, section "Experimental Results", on-policy: 50 grasps each 1,000 steps. The exploration
+    schedule is that of the released code; the paper's text prints its duration as "10000, 10000".
+    """
+
+    start: Path | None = setting(
+        None,
+        help="Run of grasp-train to go on from: its weights, optimiser, step, settings and shards; from scratch where "
+        "not given.",
+    )
+    checkpoint: int | None = setting(None, help="Training step of the start run's checkpoint; its last.", minimum=0)
+    rounds: int = setting(5, help="Rounds: first grasps, then training.", minimum=1)
+    grasps: int = setting(50, help="Grasps of the latest policy in each round.", minimum=1)
+    steps_per_round: int = setting(
+        1_000, help="Gradient steps of each round, such as 500 or 1k.", minimum=1, parse=parse_count, metavar="COUNT"
+    )
+    exploration_start: float = setting(
+        1.0, help="Probability of a random action in place of the policy's, at training step 0.", minimum=0, maximum=1
+    )
+    exploration_end: float = setting(
+        0.05, help="That probability from --exploration-steps on; linear between.", minimum=0, maximum=1
+    )
+    exploration_steps: int = setting(
+        100_000,
+        help="Training steps (the start run's count) in which it gets there, such as 10k.",
+        minimum=1,
+        parse=parse_count,
+        metavar="COUNT",
+    )
+    descend_probability: float = setting(
+        0.9, help="Probability that a random action moves straight down.", minimum=0, maximum=1
+    )
+    cem_iterations: int = setting(CemSettings.iterations, help="Iterations of CEM.", minimum=1, maximum=100)
+    cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
+    cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
+    cem_answer: Answer = setting(
+        CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
+    )
+    objects: Path | None = setting(
+        None, help="Folder of the object set; the one that the base pool was made with where it is not given."
+    )
+    workers: int | None = setting(
+        None,
+        help="Simulator processes, all cores where not given, 0 for the training process itself; changes no grasp.",
+        minimum=0,
+    )
+
+    @property
+    def cem(self) -> CemSettings:
+        """The search by which a Q-function acts."""
+        return CemSettings(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_answer)
+
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UserError: a value is unknown or out of range.
+        """
+        super().__post_init__()
+        _ = self.cem  # refuses more elites than samples
+
+    def exploration(self, step: int) -> float:
+        """Return the probability of a random action at a training step.
+
+        ε(n) = ε₀ + (ε₁ - ε₀) min(n / N, 1)
+        """
+        done = min(step / self.exploration_steps, 1.0)
+        return self.exploration_start + (self.exploration_end - self.exploration_start) * done
+
+    def deciding(self) -> dict[str, Any]:
+        """Return the settings that decide what is collected, as JSON."""
+        return {name: value for name, value in self.to_json().items() if name not in FREE_SETTINGS}
+
+
+def _options_type() -> type[OnlineSettings]:
+    """Return the dataclass of the command line: the settings of the rounds, and of training with None as default."""
+    hints = typing.get_type_hints(TrainSettings)
+    shown = {field.name: field for field in dataclasses.fields(TrainOptions)}
+    fields: list[Any] = []
+    for field in dataclasses.fields(TrainSettings):
+        if field.name == "steps":
+            continue
+        several = typing.get_origin(hints[field.name]) is tuple
+        hint = hints[field.name] if several else hints[field.name] | None
+        text = _HELP.get(field.name) or _with_default(shown[field.name])
+        metadata = {**field.metadata, "help": text}
+        fields.append((field.name, hint, dataclasses.field(default=() if several else None, metadata=metadata)))
+    made: type[OnlineSettings] = dataclasses.make_dataclass(
+        "OnlineOptions", fields, bases=(OnlineSettings,), frozen=True
+    )
+    return made
+
+
+def _with_default(field: "dataclasses.Field[Any]") -> str:
+    text: str = field.metadata["help"]
+    return text if field.default is None or text.endswith("]") else f"{text} [default: {field.default}]"
+
+
+OnlineOptions = _options_type()

@@ -1,0 +1,93 @@
+"""The one table of a sweep: a row for each job, as CSV, as JSON lines and in Markdown.
+
+It is made anew from the jobs' own files each time, never added to.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from graspq.common.files import write_text
+from graspq.evaluate.report_sweeps import SWEEP_FILE
+from graspq.studies.state import State
+
+VARIED = ("algo", "learning_rate", "width", "discount", "exploration_steps", "seed")
+COLUMNS = (
+    "id", *VARIED, "status", "steps", "success_rate", "ci95_low", "ci95_high", "successes", "episodes",
+    "training_seconds", "reason",
+)  # fmt: skip
+CSV_FILE = "sweep.csv"
+
+
+def row_of(state: State) -> dict[str, Any]:
+    """Return a job's row; what is not known yet, or not used, is None."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS) | state.job.to_json()
+    row |= {"status": state.status, "steps": state.steps, "reason": state.reason}
+    row["training_seconds"] = state.training_seconds
+    if state.evaluation is not None:
+        summary = state.evaluation.summary
+        row |= {name: summary[name] for name in ("success_rate", "successes", "episodes")}
+        row["ci95_low"], row["ci95_high"] = summary["ci95"]
+    return row
+
+
+def write_tables(folder: Path, states: Sequence[State]) -> None:
+    """Write `sweep.jsonl` and `sweep.csv`, each atomically."""
+    rows = [row_of(state) for state in states]
+    write_text(folder / SWEEP_FILE, "".join(json.dumps(row) + "\n" for row in rows))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(folder / CSV_FILE, text.getvalue())
+
+
+def as_markdown(states: Sequence[State]) -> str:
+    """Return the table in Markdown: estimators in the plan's order, within each by success, what failed last.
+
+    A column in which no job has a value is left out.
+    """
+    order = {algo: index for index, algo in enumerate(dict.fromkeys(state.job.algo for state in states))}
+    rows = sorted((row_of(state) for state in states), key=lambda row: (order[row["algo"]], *_rank(row)))
+    varied = [name for name in VARIED if any(row[name] is not None for row in rows)]
+    heads = [name.replace("_", " ") for name in varied] + ["success", "95 % interval", "steps", "training", "status"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    lines += ["| " + " | ".join([*(_text(row[name]) for name in varied), *_outcome(row)]) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _rank(row: dict[str, Any]) -> tuple[int, float]:
+    place = {"done": 0, "to do": 1, "failed": 2}[row["status"]]
+    return place, -row["success_rate"] if row["success_rate"] is not None else 0.0
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"`{value}`" if isinstance(value, str) else f"{value:.12g}"
+
+
+def _outcome(row: dict[str, Any]) -> list[str]:
+    done = row["success_rate"] is not None
+    seconds = row["training_seconds"]
+    return [
+        f"{row['success_rate']:.3f}" if done else "",
+        f"{row['ci95_low']:.3f} to {row['ci95_high']:.3f}" if done else "",
+        f"{row['steps']:,}",
+        f"{seconds:,.0f} s" if seconds is not None else "",
+        "failed: " + row["reason"].replace("|", "\\|") if row["status"] == "failed" else row["status"],
+    ]
+
+
+def line_of(state: State) -> str:
+    """Return what became of a job in one line, for the terminal."""
+    if state.evaluation is None:
+        outcome = f"failed: {state.reason}" if state.reason is not None else "stopped; the same command goes on with it"
+        return f"{state.job.id}: {outcome}"
+    summary = state.evaluation.summary
+    low, high = summary["ci95"]
+    seconds = f", {state.training_seconds:,.0f} s of training" if state.training_seconds is not None else ""
+    return f"{state.job.id}: {100 * summary['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}){seconds}"

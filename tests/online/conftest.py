@@ -1,0 +1,71 @@
+"""A small but real on-policy world: forty random grasps, a run of six steps on them, and plans that go on from it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from graspq.datagen.collect import collect_block
+from graspq.datagen.run import describe
+from graspq.datagen.settings import CollectionSettings, DatagenSettings
+from graspq.datasets.writer import commit_shard, write_shard
+from graspq.objects.object_set import ObjectSet
+from graspq.online.plan import Plan, resolve
+from graspq.online.settings import OnlineOptions
+from graspq.sim.episode import GraspSimulation
+from graspq.sim.task import TASKS
+from graspq.train.loop import train
+from graspq.train.settings import preset_settings
+
+BLOCKS, BLOCK_SIZE = 8, 5
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Two runs are compared bit by bit."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def base(regular_objects: ObjectSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty grasps of the random policy, with the object set beside them."""
+    folder, task = tmp_path_factory.mktemp("data") / "base", TASKS["regular"]
+    settings = replace(CollectionSettings(), block_size=BLOCK_SIZE)
+    manifest = replace(describe(DatagenSettings(), task, regular_objects), settings=settings.described())
+    regular_objects.copy_to(folder / "objects")
+    with GraspSimulation(task, regular_objects) as simulation:
+        blocks = [collect_block(simulation, settings, block, BLOCK_SIZE) for block in range(BLOCKS)]
+    manifest.save(folder)
+    commit_shard(folder, manifest, write_shard(folder, manifest, 0, BLOCKS, [one for block in blocks for one in block]))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def start(base: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of `dql` with a small network, six steps long."""
+    folder = tmp_path_factory.mktemp("runs") / "start"
+    train(
+        preset_settings(
+            "paper", algo="dql", shards=(str(base),), out=folder, steps=6, batch_size=8, width=8, log_every=2,
+            average_decay=0.9, validation_fraction=0.3, validate_every=4, checkpoint_every=3, lag_steps=4,
+            device="cpu", threads=1,
+        )
+    )  # fmt: skip
+    return folder
+
+
+MakePlan = Callable[..., Plan]
+
+
+@pytest.fixture(scope="session")
+def make_plan(start: Path) -> MakePlan:
+    """Return plans of three rounds of two grasps and six steps, simulated in this process."""
+
+    def make(out: Path, **given: Any) -> Plan:
+        short = {"start": start, "rounds": 3, "grasps": 2, "steps_per_round": 6, "exploration_steps": 20, "workers": 0}
+        return resolve(OnlineOptions(**short | {"out": out} | given))
+
+    return make

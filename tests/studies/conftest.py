@@ -1,0 +1,95 @@
+"""Files of jobs as the commands write them, and a small but real dataset to run some on."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graspq.evaluate.records import EpisodeRow, write_rows, write_summary
+from graspq.evaluate.settings import CemSettings
+from graspq.evaluate.statistics import wilson_interval
+from graspq.objects.object_set import ObjectSet
+from graspq.studies.plan import Job, Plan
+from graspq.studies.state import run_folder
+from graspq.train.run import Run, checkpoint_name
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+JOBS = (
+    Job("dql", 0.01, 32, 0.9, None, 0),
+    Job("dql", 0.001, 32, 0.9, None, 0),
+    Job("mc", 0.001, 64, None, None, 0),
+)
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return Plan("small", False, ("data",), None, "test", 100, 10, (), JOBS)
+
+
+def trained(folder: Path, job: Job, step: int, rows: tuple[dict[str, Any], ...] = ()) -> Run:
+    """A run folder with its configuration, metrics and the newest checkpoint's folder."""
+    run = Run.create_or_resume(run_folder(folder, job), {"settings": {"batch_size": 32}, "network": 0, "dataset": {}})
+    for row in rows:
+        run.append_metrics(row)
+    (run.checkpoints_folder / checkpoint_name(step)).mkdir(parents=True)
+    return run
+
+
+def scored(folder: Path, job: Job, successes: int, step: int = 100, episodes: int = 10, **changed: Any) -> Path:
+    """An evaluation of a job's run, by the real writers."""
+    place = run_folder(folder, job) / "evaluations" / f"regular-test-seed0-{episodes}-{step}"
+    place.mkdir(parents=True)
+    rows = [EpisodeRow(index, 0, (), index < successes, None, 4, "height", 0.0, None) for index in range(episodes)]
+    write_rows(place, rows)
+    summary = {
+        "format_version": 1, "task": "regular", "split": "test", "episodes": episodes, "successes": successes,
+        "success_rate": successes / episodes, "ci95": list(wilson_interval(successes, episodes)), "label": job.id,
+        "job": {}, "seed": 0, "checkpoint_step": step, "cem": CemSettings().to_json(), "policy": "cem",
+    }  # fmt: skip
+    write_summary(place, summary | changed)
+    return place
+
+
+@pytest.fixture
+def write() -> Any:
+    """The writers of a job's files."""
+
+    class Write:
+        trained: Callable[..., Run] = staticmethod(trained)
+        scored: Callable[..., Path] = staticmethod(scored)
+
+    return Write
+
+
+@pytest.fixture(scope="session")
+def dataset(regular_objects: ObjectSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve grasps of the random policy, collected and written as grasp-datagen does."""
+    from graspq.datagen.collect import collect_block
+    from graspq.datagen.settings import CollectionSettings
+    from graspq.datasets.manifest import Manifest
+    from graspq.datasets.writer import commit_shard, write_shard
+    from graspq.sim.episode import GraspSimulation
+    from graspq.sim.task import task_settings
+
+    folder, task = tmp_path_factory.mktemp("data") / "regular", task_settings("regular")
+    settings = replace(CollectionSettings(), block_size=3)
+    manifest = Manifest(
+        task=task.to_json(),
+        settings=settings.described(),
+        versions={},
+        object_set={"name": regular_objects.name, "sha256": regular_objects.digest()},
+        image_shape=(task.image_size, task.image_size, 3),
+        action_limits=task.action_limits,
+        discount=1.0,
+        phi_range=(-task.phi_limit, task.phi_limit),
+    )
+    regular_objects.copy_to(folder / "objects")
+    with GraspSimulation(task, regular_objects) as simulation:
+        blocks = [collect_block(simulation, settings, block, 3) for block in range(4)]
+    manifest.save(folder)
+    commit_shard(folder, manifest, write_shard(folder, manifest, 0, 4, [one for block in blocks for one in block]))
+    return folder

@@ -1,0 +1,46 @@
+"""The command: a plan that is only printed, and one line for every mistake."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graspq.studies.cli import main
+
+
+def grasp_sweep(*words: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(words, prog_name="grasp-sweep")
+    return int(ended.value.code or 0)
+
+
+def test_a_dry_run_prints_every_job_and_the_count_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert grasp_sweep("--preset", "paper", "--dry-run") == 0
+    done = capsys.readouterr()
+    assert done.out.count("  to do\n") == 540
+    assert "540 jobs (54 supervised, 108 dql, 54 mc, 108 corr-mc, 108 ddpg, 108 pcl)" in done.out
+    assert "misprint" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--algo", "mc"), "data/regular-10k"),
+        (("--preset", "paper", "--algo", "mc", "dql"), "data/regular-100k"),
+        (("--algo", "sarsa"), "'sarsa' is unknown"),
+        (("--learning-rate", "0"), "--learning-rate: expected numbers above 0"),
+        (("--steps", "few"), "expected a whole number"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_two_and_nothing_is_written(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert grasp_sweep(*words) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert said in lines[-1]
+    assert list(tmp_path.iterdir()) == []

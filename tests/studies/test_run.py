@@ -1,0 +1,80 @@
+"""A real sweep: stopped by a signal, killed, gone on with; one of its jobs diverges."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graspq.common.errors import UserError
+from graspq.studies import run
+from graspq.studies.cli import main
+from graspq.studies.run import locked
+from graspq.train.run import Run
+
+ID, DIVERGING = "mc-lr0.001-width4-seed0", "mc-lr1e+30-width4-seed0"
+
+
+def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
+    until = time.monotonic() + 120
+    while not path.exists():
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_stops_nothing(
+    dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--algo", "mc", "--learning-rate", "0.001", "1e30", "--width", "4", "--shards", str(dataset)]
+    words += ["--steps", "30", "--episodes", "2", "--jobs", "2", "--threads", "1", "--device", "cpu"]
+    words += ["--out", str(tmp_path)]
+    sweep = [str(Path(sys.executable).with_name("grasp-sweep")), *words]
+
+    process = subprocess.Popen(sweep)
+    wait_for(tmp_path / "logs" / f"{ID}.log", process)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=120) == 130
+    assert not (tmp_path / "failures").exists()
+
+    process = subprocess.Popen(sweep)
+    wait_for(tmp_path / "runs" / ID / "config.json", process)
+    process.kill()
+    process.wait()
+    capfd.readouterr()
+    with locked(tmp_path):  # free: no command of the killed sweep lives on
+        pass
+
+    with pytest.raises(SystemExit) as ended:
+        main(words, prog_name="grasp-sweep")
+    out, err = capfd.readouterr()
+    assert ended.value.code == 1
+    rows = {row["id"]: row for row in map(json.loads, (tmp_path / "sweep.jsonl").read_text().splitlines())}
+    assert [(row["status"], row["steps"], row["episodes"]) for row in rows.values()] == [
+        ("done", 30, 2),
+        ("failed", 0, None),
+    ]
+    assert rows[DIVERGING]["reason"].startswith("mc diverged at step ")
+    assert out.count("\n") == 4 and "failed: mc diverged" in out
+    assert "[2/2] " in err and "step/s" not in err
+    logged = [row["step"] for row in Run.open(tmp_path / "runs" / ID).metrics() if "loss" in row]
+    assert logged == sorted(set(logged)) and logged[-1] == 30
+
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit) as ended:
+        main(words, prog_name="grasp-sweep")
+    assert ended.value.code == 1
+    assert "2 of 2 jobs finished before" in capfd.readouterr().err
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*") if path.is_file()}
+
+
+def test_a_folder_belongs_to_one_sweep_at_a_time(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
+    with locked(tmp_path), pytest.raises(UserError, match="another grasp-sweep works here"), locked(tmp_path):
+        pass
+    with locked(tmp_path):
+        pass

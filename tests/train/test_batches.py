@@ -1,0 +1,78 @@
+"""A pool that lies on the device gives the very batches that are streamed from the shards."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from graspq.common.errors import UserError
+from graspq.datasets.dataset import open_shards
+from graspq.train.batch import Batch
+from graspq.train.batches import batch_rows, is_resident, training_batches
+from graspq.train.distributed import ALONE, Ranks
+from graspq.train.estimators import ESTIMATORS
+from graspq.train.loop import train
+from graspq.train.resident import ResidentPool, image_bytes
+from graspq.train.run import Run
+from graspq.train.settings import TrainSettings
+
+Make = Callable[..., TrainSettings]
+CPU = torch.device("cpu")
+
+
+def batches(settings: TrainSettings, count: int, start: int = 0, ranks: Ranks = ALONE) -> list[Batch]:
+    pool = open_shards(settings.shards).with_discount(0.7)
+    estimator = ESTIMATORS[settings.algo]
+    with training_batches(pool, settings, estimator, CPU, start, ranks) as endless:
+        return list(itertools.islice(endless, count))
+
+
+def assert_same(first: Batch, second: Batch) -> None:
+    for field in dataclasses.fields(Batch):
+        one, other = getattr(first, field.name), getattr(second, field.name)
+        if isinstance(one, Tensor):
+            assert one.dtype == other.dtype and one.shape == other.shape, field.name
+            assert torch.equal(one, other), field.name
+        else:
+            assert one is None and other is None, field.name
+
+
+@pytest.mark.parametrize("algo", ["mc", "dql", "corr-mc"])
+@pytest.mark.parametrize("ranks", [ALONE, Ranks(1, 3)])
+def test_resident_batches_are_those_of_the_stream_bit_by_bit(settings: Make, algo: str, ranks: Ranks) -> None:
+    # Beyond the end of an epoch.
+    streamed, resident = (batches(settings(algo, resident=resident), 40, 5, ranks) for resident in ("no", "yes"))
+    for first, second in zip(streamed, resident, strict=True):
+        assert_same(first, second)
+    assert (streamed[0].next_image is not None) == (algo == "dql")
+
+
+def test_a_resident_run_ends_in_the_same_bits_and_may_go_on_streamed(settings: Make, tmp_path: Path) -> None:
+    train(settings("corr-mc", out=tmp_path / "streamed", resident="no"))
+    train(settings("corr-mc", out=tmp_path / "both", resident="yes"), stop_at=10)
+    train(settings("corr-mc", out=tmp_path / "both", resident="no"))
+    first, second = (Run.open(tmp_path / name).checkpoint(20) for name in ("streamed", "both"))
+    assert (first / "state.json").read_bytes() == (second / "state.json").read_bytes(), "digests of all tensors"
+
+
+def test_auto_streams_on_a_cpu_and_what_was_asked_for_is_done() -> None:
+    assert [is_resident(asked, CPU, 1) for asked in ("auto", "yes", "no")] == [False, True, False]
+
+
+def test_images_that_fit_nowhere_are_refused_in_one_line(dataset: Path) -> None:
+    pool = open_shards([dataset])
+    first = dataclasses.replace(pool.blocks[0], rows=2**52)
+    with pytest.raises(UserError, match="use --resident no"):
+        ResidentPool.read(dataclasses.replace(pool, blocks=(first, *pool.blocks[1:])), CPU)
+
+
+def test_a_batch_of_episodes_has_about_as_many_transitions(settings: Make, dataset: Path) -> None:
+    pool = open_shards([dataset])
+    rows = batch_rows(pool, settings("corr-mc"), ESTIMATORS["corr-mc"])
+    assert abs(rows * pool.rows / pool.episodes - 32) < pool.rows / pool.episodes
+    assert batch_rows(pool, settings("mc"), ESTIMATORS["mc"]) == 32
+    assert image_bytes(pool) == pool.rows * 16 * 16 * 3

@@ -1,0 +1,87 @@
+"""`supervised`: its labels, the motions it measures in the data, and what a search is given of them."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from graspq.datasets.dataset import ShardPool, open_shards
+from graspq.train.checkpoint import load_acting
+from graspq.train.estimators import ESTIMATORS
+from graspq.train.loop import train
+from graspq.train.selection import SearchSpace
+from graspq.train.settings import TrainSettings
+from graspq.train.supervised import measured_motions, motions_at
+
+
+def motions_of(pool: ShardPool, step: int) -> np.ndarray:
+    blocks = [pool.read_block(ref) for ref in pool.blocks]
+    records = np.concatenate([block.records for block in blocks])
+    return records["synthetic_action"][records["step"] == step]
+
+
+def test_the_motions_of_each_step_are_measured_and_steps_never_seen_take_the_last_seen_ones(dataset: Path) -> None:
+    pool = open_shards([dataset])
+    extra = measured_motions(pool)
+    assert {name: list(tensor.shape) for name, tensor in extra.items()} == {
+        f"synthetic_{name}": [15, 4] for name in SearchSpace._fields
+    }
+    for step in (0, 1):
+        motions = motions_of(pool, step)
+        for name, expected in (("low", motions.min(0)), ("high", motions.max(0))):
+            assert np.array_equal(extra[f"synthetic_{name}"][step].numpy(), expected)
+        np.testing.assert_allclose(extra["synthetic_mean"][step], motions.mean(0), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(extra["synthetic_deviation"][step], motions.std(0), rtol=0, atol=1e-4)
+    assert not torch.equal(extra["synthetic_low"][0], extra["synthetic_low"][1])
+    for tensor in extra.values():
+        assert torch.equal(tensor[2:], tensor[1].expand(13, -1)), "no episode has a third step"
+
+
+def test_a_motion_seen_once_gives_numbers_and_no_nan(dataset: Path) -> None:
+    pool = open_shards([dataset])
+    few = dataclasses.replace(pool, blocks=pool.blocks[:1])
+    assert all(bool(tensor.isfinite().all()) for tensor in measured_motions(few).values())
+
+
+def test_a_search_gets_the_row_of_its_step_and_the_last_row_after_it() -> None:
+    extra = {f"synthetic_{name}": torch.arange(3.0).unsqueeze(1) + 10 * i for i, name in enumerate(SearchSpace._fields)}
+    space = motions_at(extra, torch.tensor([1, 0, 7]))
+    assert torch.equal(space.mean, torch.tensor([[1.0], [0.0], [2.0]]))
+    assert torch.equal(space.high, torch.tensor([[31.0], [30.0], [32.0]]))
+
+
+def test_the_box_is_of_the_training_part_alone_and_lies_in_the_checkpoint(
+    settings: Callable[..., TrainSettings],
+) -> None:
+    chosen = settings("supervised", steps=2, validation_fraction=0.5)
+    run = train(chosen)
+    training, _ = open_shards(chosen.shards).split(0.5, chosen.seed)
+    kept = load_acting(run.folder).extra
+    expected = measured_motions(training)
+    assert kept.keys() == expected.keys()
+    assert all(torch.equal(kept[name], expected[name]) for name in expected)
+
+
+def test_labels_are_outcomes_without_discount_whatever_the_datasets_discount_is(
+    settings: Callable[..., TrainSettings],
+    two_states: SimpleNamespace,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = two_states.dataset(tmp_path / "discounted", 30, discount=0.5)
+    run = train(settings("supervised", shards=(str(folder),), steps=2))
+    assert run.config["discount"] == 1.0 and "discount 1" in run.config["mc_return"]
+    assert "supervised: returns are made from the rewards with discount 1" in capsys.readouterr().err
+    pool = open_shards([folder]).with_discount(1.0)
+    returns = pool.read_block(pool.blocks[0]).records["mc_return"]
+    assert set(returns.tolist()) == {0.0, 1.0}
+
+
+def test_the_row_regresses_on_synthetic_actions() -> None:
+    row = ESTIMATORS["supervised"]
+    batch = SimpleNamespace(action="logged", synthetic_action="synthetic")
+    assert row.action(batch) == "synthetic" and row.acting == "synthetic search"  # type: ignore[arg-type]
