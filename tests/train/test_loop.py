@@ -155,7 +155,7 @@ def test_the_datasets_own_discount_needs_no_word(settings: Make, capsys: pytest.
 
 
 def test_a_discount_for_supervised_is_refused(settings: Make) -> None:
-    with pytest.raises(UserError, match="--discount: .* have no discount, got 0.9"):
+    with pytest.raises(UserError, match=r"--discount: .* have no discount, got 0\.9"):
         train(settings("supervised", discount=0.9))
 
 
