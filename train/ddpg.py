@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from graspq.train.batch import Batch
-from graspq.train.selection import QOfActions, pointed
+from graspq.train.selection import FARTHEST_POINT, QOfActions, pointed
 from graspq.train.targets import bootstrapped
 from graspq.train.updates import descend, regression
 
@@ -74,7 +74,7 @@ def uphill(q_of_actions: QOfActions, direction: Tensor) -> Tensor:
     """Return which way Q rises at the actions that an actor points at.
 
         g = clip(∂Q(s, a) / ∂a, -1, 1) at a = clip(direction, -1, 1),
-        gᵢ = 0 where directionᵢ is at or beyond a bound and gᵢ points further out
+        times -(|directionᵢ| - 1) / 0.25 where directionᵢ is at or beyond a bound and gᵢ points further out: back again
 
     Args:
         q_of_actions: Q-function of candidates, in evaluation mode.
@@ -91,4 +91,5 @@ def uphill(q_of_actions: QOfActions, direction: Tensor) -> Tensor:
         (gradient,) = torch.autograd.grad(q.float().sum(), action)
     gradient = gradient.clamp(-STEEPEST, STEEPEST)
     outward = (direction.abs() >= 1) & (gradient * direction > 0)
-    return gradient.masked_fill(outward, 0)
+    back = -gradient * (direction.abs() - 1) / (FARTHEST_POINT - 1)
+    return torch.where(outward, back, gradient)

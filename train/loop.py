@@ -171,7 +171,6 @@ class Session:
         settings, state = self.settings, self.state
         if state.step >= last:
             return
-        augmentation = Augmentation(settings.shift, settings.mirror, settings.jitter, settings.action_noise)
         pool = pool.with_discount(self.discount)
         rows = batch_rows(pool, settings, self.estimator)
         device, ranks = self.precision.device, self.ranks
@@ -181,9 +180,7 @@ class Session:
             while state.step < last and not ranks.any(interruption.requested):
                 with progress.timed():
                     batch = next(batches)
-                    part = BatchPart.of(ranks, rows, batch.real_steps)
-                    batch = augmentation(batch, seeded("train/augment", settings.seed, state.step), part)
-                    loss = self._update(batch, part)
+                    loss = self.update(batch, BatchPart.of(ranks, rows, batch.real_steps))
                 progress.count(loss, self.watched)
                 self._after_step(progress)
             if self.saved_step != state.step:
@@ -194,16 +191,24 @@ class Session:
         if interrupted:
             raise KeyboardInterrupt
 
-    def _update(self, batch: Batch, part: BatchPart) -> Tensor:
-        """Take one step; return its loss."""
-        rate = learning_rate(self.settings, self.state.step)
+    def update(self, batch: Batch, part: BatchPart = WHOLE) -> Tensor:
+        """Take one step on a batch as the loader gives it; return its loss.
+
+        Args:
+            batch: this rank's.
+            part: which part of the whole batch that is.
+        """
+        settings = self.settings
+        augmentation = Augmentation(settings.shift, settings.mirror, settings.jitter, settings.action_noise)
+        batch = augmentation(batch, seeded("train/augment", settings.seed, self.state.step), part)
+        rate = learning_rate(settings, self.state.step)
         for optimizer in self.state.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = rate
-        generator = seeded("train/candidates", self.settings.seed, self.state.step)
+        generator = seeded("train/candidates", settings.seed, self.state.step)
         context = self._context(self.state.learned, generator, part)
         loss = self.estimator.update(self.state, batch, self.estimator, context)
-        advance(self.state, self.settings)
+        advance(self.state, settings)
         for name, value in self.watched.items():
             self.watched[name] = part.mean(value)
         return part.mean(loss)

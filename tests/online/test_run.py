@@ -120,10 +120,10 @@ COLLECTING = [
 TRAINING = [
     (loop, "save_checkpoint", 1),  # before the first
     (Run, "append_metrics", 1),  # grasps are committed, their row is missing
-    (loop.Session, "_update", 9),  # between two checkpoints
+    (loop.Session, "update", 9),  # between two checkpoints
     (loop, "save_checkpoint", 2),  # at one
     (Run, "append_metrics", 4),
-    (loop.Session, "_update", 2),
+    (loop.Session, "update", 2),
 ]
 
 

@@ -60,7 +60,7 @@ def test_the_preset_decides_what_the_command_line_leaves_out(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--algo", "sarsa", "--shards", "x"], "--algo: 'sarsa' is unknown; choose from dql, mc"),
+        (["--algo", "sarsa", "--shards", "x"], "--algo: 'sarsa' is unknown; choose from supervised, dql, mc, corr-mc"),
         (["--algo", "mc"], "Missing option '--shards'"),
         (["--algo", "mc", "--shards", "nowhere"], "nowhere"),
         (["--algo", "mc", "--shards", "."], "."),

@@ -171,8 +171,8 @@ def test_the_step_of_a_loss_that_is_not_finite_is_named_and_the_checkpoint_befor
     run = train(chosen, stop_at=3)
 
     class Poisoned(loop.Session):
-        def _update(self, batch: loop.Batch, part: loop.BatchPart) -> torch.Tensor:
-            loss = super()._update(batch, part)
+        def update(self, batch: loop.Batch, part: loop.BatchPart) -> torch.Tensor:
+            loss = super().update(batch, part)
             return loss * torch.nan if self.state.step == 5 else loss
 
     original = loop.Session
