@@ -1,10 +1,15 @@
 """Real, small object sets that the tests of several folders share."""
 
 import pytest
+from hypothesis import settings
 
 from graspq.objects.object_set import ObjectSet
 from graspq.objects.procedural import make_procedural
 from graspq.objects.targeted import make_targeted
+
+# Machines that others share are slow now and then; an example's time says nothing about the code.
+settings.register_profile("shared-machine", deadline=None)
+settings.load_profile("shared-machine")
 
 
 @pytest.fixture(scope="session")

@@ -157,7 +157,7 @@ def test_the_command_killed_with_sigkill_and_resumed_ends_as_an_unbroken_run(
     out = tmp_path / "run"
     process = subprocess.Popen(command(start, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while len(list((out / "dataset/shards").glob("blocks-*"))) < 2:
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.02)

@@ -20,7 +20,7 @@ ID, DIVERGING = "mc-lr0.001-width4-seed0", "mc-lr1e+30-width4-seed0"
 
 
 def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
-    until = time.monotonic() + 120
+    until = time.monotonic() + 300
     while not path.exists():
         assert process.poll() is None and time.monotonic() < until
         time.sleep(0.02)
