@@ -226,6 +226,7 @@ class Session:
             extra=self.state.extra,
             anneal=self.settings.anneal,
             actor_rest=self.settings.actor_rest,
+            actor_rate=self.settings.actor_rate,
             path_steps=self.settings.path_steps,
             penalty=self.settings.penalty,
             kl_bound=self.settings.kl_bound,

@@ -31,8 +31,8 @@ dz = -1 exactly in 90 % of the logged actions: a normal distribution puts a dens
 mass beyond the box where its mean is -1. Likelihood would then grow without end as σ falls; the residual does not, for
 it sees log π - log π' and V takes up whatever is common to all logged actions. Measured: with rewards that do not
 depend on the action μ and σ of dz stay at (-1, 0.5) to 0.001 where V is right from the start; where V starts 0.25 too
-low they drift with the data to (-0.82, 0.42) until V has caught up. Where dz = -1 alone succeeds σ falls to its bound
-(0.1004 after 60 lagged copies) and μ to its own (-1.25, acting as -1). All numbers are finite: the two bounds keep
+low they drift with the data to (-0.91, 0.45) until V has caught up. Where dz = -1 alone succeeds σ falls to its bound
+(0.103 after 40 lagged copies) and μ to its own (-1.24, acting as -1). All numbers are finite: the two bounds keep
 log π - log π' below 1,100 for any action. The tests hold these to be true.
 """
 

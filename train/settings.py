@@ -33,7 +33,8 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "jitter": 0.0,
         "action_noise": 0.0,
         "anneal": 0.5,
-        "actor_rest": 0.1,
+        "actor_rest": 0.2,
+        "actor_rate": 0.1,
         "path_steps": None,
         "penalty": None,
         "precision": "auto",
@@ -55,6 +56,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "action_noise": 0.0,
         "anneal": 0.05,
         "actor_rest": 0.0,
+        "actor_rate": 1.0,
         "path_steps": 10,
         "penalty": 3.0,
         "precision": "float32",
@@ -126,6 +128,9 @@ class TrainSettings(Settings):
         help="Part of the steps in which ddpg's actor stays as it began, while Q learns.",
         minimum=0,
         maximum=1,
+    )
+    actor_rate: float = _preset_setting(
+        "actor_rate", help="Learning rate of ddpg's actor over that of Q.", minimum=0, maximum=10
     )
     path_steps: int | None = _preset_setting(
         "path_steps", help="Steps d of a path of pcl; the rest of the episode where it is not given.", minimum=1

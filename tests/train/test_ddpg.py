@@ -70,7 +70,7 @@ def batch(**changes: Tensor | None) -> Batch:
 
 def test_an_output_of_zero_points_straight_down_and_no_output_points_far_outside_the_box() -> None:
     torch.testing.assert_close(pointed(torch.zeros(1, 4)), torch.tensor([[0.0, 0.0, -1.0, 0.0]]))
-    assert float(pointed(torch.full((1, 4), 1e6)).abs().max()) <= 1.25
+    assert float(pointed(torch.full((1, 4), 1e6)).abs().max()) < 1.25001
 
 
 def test_the_target_judges_the_lagged_actors_action_by_the_lagged_critic_and_clips_it() -> None:
