@@ -26,7 +26,7 @@ from torch import Tensor
 from graspq.train.batch import Batch
 from graspq.train.selection import FARTHEST_POINT, QOfActions, pointed
 from graspq.train.targets import bootstrapped
-from graspq.train.updates import descend, regression
+from graspq.train.updates import descend, regression, slow_down
 
 if TYPE_CHECKING:
     from graspq.train.estimators import Estimator
@@ -68,8 +68,7 @@ def actor_critic(state: "TrainState", batch: Batch, estimator: "Estimator", cont
     with context.autocast():
         direction = pointed(actor(image, step))
         gradient = uphill(q_of_actions, direction.detach())
-    for group in state.optimizers["actor"].param_groups:
-        group["lr"] *= context.actor_rate
+    slow_down(state.optimizers["actor"], context.actor_rate)
     descend(state.optimizers["actor"], -(gradient * direction).sum(-1).mean(), context.part)
     return loss
 

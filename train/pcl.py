@@ -21,8 +21,11 @@ configuration" is what the release holds of it, and where that is silent their c
 6. The mean lies within 1.25 times the box (`selection.pointed`) and starts straight down.
 7. Both policies run with the same running statistics of batch normalisation; see `_share_statistics`.
 8. Adam's gradients of π are divided by λ; see `path_consistency`. No clipping of advantages or gradients.
-9. The step is in the state, as for all rows (their configuration: not). Discount 0.9 as for all (their configuration:
-   0.95, `--discount`), learning rate as for all (theirs: 1e-4).
+9. The policy's learning rate is a tenth of V's (`--actor-rate`, as for `ddpg`; 1 with `--preset paper`). At V's rate
+   and with 256 transitions of the 10k dataset a batch, KL(π‖π') rose to 0.28 within one lagged copy while V had learned
+   nothing, the mean of dphi swung from 1.0 to -1.1, and all states had the same action.
+10. The step is in the state, as for all rows (their configuration: not). Discount 0.9 as for all (their configuration:
+    0.95, `--discount`), V's learning rate as for all (theirs: 1e-4).
 
 Bias: the square of a residual also counts the chance in transitions and rewards (as for every residual-gradient
 method); what a lucky transition brought is in part laid to the actions after it.
@@ -33,7 +36,8 @@ it sees log π - log π' and V takes up whatever is common to all logged actions
 depend on the action μ and σ of dz stay at (-1, 0.5) to 0.001 where V is right from the start; where V starts 0.25 too
 low they drift with the data to (-0.91, 0.45) until V has caught up. Where dz = -1 alone succeeds σ falls to its bound
 (0.103 after 40 lagged copies) and μ to its own (-1.24, acting as -1). All numbers are finite: the two bounds keep
-log π - log π' below 1,100 for any action. The tests hold these to be true.
+log π - log π' below 1,100 for any action. The tests hold these to be true. On the 10k dataset, after 160 steps of 128
+transitions: μ of dz -1.02, σ 0.49, log density at dz = -1 of -0.21, and 0.52 of the mass below -1.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -45,6 +49,7 @@ from graspq.datasets.dataset import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.selection import pointed
 from graspq.train.targets import path_consistent
+from graspq.train.updates import slow_down
 
 if TYPE_CHECKING:
     from graspq.train.estimators import Estimator
@@ -126,6 +131,7 @@ def path_consistency(state: "TrainState", batch: Batch, estimator: "Estimator", 
     for optimizer in state.optimizers.values():
         optimizer.zero_grad(set_to_none=True)
     (loss * context.part.share).backward()  # type: ignore[no-untyped-call]
+    slow_down(state.optimizers["actor"], context.actor_rate)
     _divide_gradients(state.learned["actor"], _penalty(context))
     for optimizer in state.optimizers.values():
         optimizer.step()

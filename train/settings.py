@@ -130,7 +130,7 @@ class TrainSettings(Settings):
         maximum=1,
     )
     actor_rate: float = _preset_setting(
-        "actor_rate", help="Learning rate of ddpg's actor over that of Q.", minimum=0, maximum=10
+        "actor_rate", help="Learning rate of the actor of ddpg and pcl over that of Q or V.", minimum=0, maximum=10
     )
     path_steps: int | None = _preset_setting(
         "path_steps", help="Steps d of a path of pcl; the rest of the episode where it is not given.", minimum=1

@@ -94,7 +94,7 @@ class Context:
         penalty: λ of path consistency; None lets the estimator tune it to `kl_bound`.
         kl_bound: what the mean relative entropy to the lagged policy is tuned to, nats.
         actor_rest: part of the training in which an actor that follows Q stays as it began.
-        actor_rate: its learning rate over that of Q.
+        actor_rate: learning rate of an actor over that of Q or V.
         watched: mean absolute values of what the task keeps near [0, 1], by name, left here by updates: the loop stops
             the run where one is out of all reason.
         part: which rows of the whole batch are here, where several ranks train together.

@@ -75,6 +75,12 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, part: BatchPart) -> 
     optimizer.step()
 
 
+def slow_down(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    """Multiply the learning rate of the optimiser's next step, which the loop sets anew before every update."""
+    for group in optimizer.param_groups:
+        group["lr"] *= factor
+
+
 def target_of(batch: Batch, estimator: "Estimator", context: "Context") -> Tensor:
     """Return the estimator's target of every real step, float32 [n], without gradient."""
     with torch.no_grad(), context.autocast():
