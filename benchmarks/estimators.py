@@ -16,7 +16,8 @@ from pathlib import Path
 import click
 from timing import median_ratio, report, take_turns
 
-from graspq.datasets.dataset import ShardPool, open_shards
+from graspq.datasets.dataset import open_shards
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.batches import training_batches
 from graspq.train.estimators import ESTIMATORS

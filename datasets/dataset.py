@@ -1,13 +1,9 @@
-"""Opens datasets and pools of shards, checking every file against its manifest before anything is read from it.
-
-A pool is what training reads: blocks of one task with the same images, action limits and discount, from any number of
-datasets.
-"""
+"""Opens datasets and pools of shards, checking every file against its manifest before anything is read from it."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +12,9 @@ import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.datasets.blocks import REMEDY, BlockArrays, BlockRef, read_block, read_columns, relabelled
+from graspq.datasets.blocks import REMEDY, BlockRef
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
+from graspq.datasets.pool import ShardPool
 
 HASHING_THREADS = 4
 
@@ -38,11 +35,11 @@ class Dataset:
         """
         return cls(Path(folder), Manifest.load(Path(folder)))
 
-    def pool(self, verify: bool = True) -> "ShardPool":
+    def pool(self, verify: bool = True) -> ShardPool:
         """Return all its shards; see `open_shards`."""
         return _pool([(self, entry) for entry in self.manifest.shards], str(self.folder), verify)
 
-    def shard_pool(self, entry: ShardEntry, verify: bool = True) -> "ShardPool":
+    def shard_pool(self, entry: ShardEntry, verify: bool = True) -> ShardPool:
         """Return one of its shards as a pool; see `open_shards`."""
         return _pool([(self, entry)], str(self.folder), verify)
 
@@ -61,82 +58,6 @@ class Dataset:
         except (OSError, pa.ArrowException, ValueError) as error:
             raise UserError(f"{self.folder / path}: cannot be read ({_one_line(error)}); {REMEDY}") from None
         return rows
-
-
-@dataclass(frozen=True, eq=False)
-class ShardPool:
-    """Blocks of one or more datasets that agree in task, image shape, action limits and discount.
-
-    Attributes:
-        blocks: ordered by seed of the dataset, then by number: the order in which they were named does not matter.
-        task: the task's settings as JSON.
-        image_shape: (H, W, C).
-        action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
-        discount: γ of `mc_return`: the stored one, or that of `with_discount`.
-        object_set: `name` and `sha256` of the object set of the first dataset.
-        manifest_digest: that of the manifest where the pool is one whole dataset, else that of the shards' digests.
-    """
-
-    blocks: tuple[BlockRef, ...]
-    task: dict[str, Any]
-    image_shape: tuple[int, int, int]
-    action_limits: tuple[float, float, float, float]
-    discount: float
-    object_set: dict[str, Any]
-    manifest_digest: str
-    _footers: dict[Path, Any] = field(default_factory=dict, repr=False)
-    _relabels: bool = field(default=False, repr=False)
-
-    @property
-    def rows(self) -> int:
-        """Number of steps."""
-        return sum(ref.rows for ref in self.blocks)
-
-    @property
-    def episodes(self) -> int:
-        """Number of episodes."""
-        return sum(ref.episodes for ref in self.blocks)
-
-    @property
-    def max_steps(self) -> int:
-        """T, the task's greatest number of steps."""
-        return int(self.task["max_steps"])
-
-    def read_block(self, ref: BlockRef) -> BlockArrays:
-        """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""
-        block = read_block(ref, self.image_shape, self._footers.get(ref.path))
-        return relabelled(block, self.discount) if self._relabels else block
-
-    def read_columns(self, ref: BlockRef, names: Sequence[str]) -> dict[str, Any]:
-        """Return some stored columns of a block; see `blocks.read_columns`."""
-        return read_columns(ref, names, self._footers.get(ref.path))
-
-    def with_discount(self, discount: float) -> "ShardPool":
-        """Return the pool with `mc_return` made from the rewards with γ in [0, 1], where that is not the stored one."""
-        return self if discount == self.discount else replace(self, discount=discount, _relabels=True)
-
-    def split(self, validation_fraction: float, seed: int) -> tuple["ShardPool", "ShardPool"]:
-        """Return (training, held back): a block is held back with probability `validation_fraction`.
-
-        Whether it is depends on `seed` and the block's identity alone, so it stays so when the dataset is extended or
-        moved. A pool of more than one block gives at least one to each side, unless the fraction is 0.
-
-        Raises:
-            UserError: the fraction is outside [0, 1).
-        """
-        if not 0.0 <= validation_fraction < 1.0:
-            raise UserError(f"--validation-fraction: expected a number in [0, 1), got {validation_fraction}")
-        ranked = sorted(self.blocks, key=lambda ref: _fraction(seed, ref))
-        count = sum(_fraction(seed, ref) < validation_fraction for ref in ranked)
-        if validation_fraction > 0 and len(ranked) > 1:
-            count = min(max(count, 1), len(ranked) - 1)
-        elif len(ranked) == 1:
-            count = 0
-        held_back = set(ranked[:count])
-        return (
-            replace(self, blocks=tuple(ref for ref in self.blocks if ref not in held_back)),
-            replace(self, blocks=tuple(ref for ref in self.blocks if ref in held_back)),
-        )
 
 
 def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPool:
@@ -286,12 +207,6 @@ def _shown(value: Any) -> str:
 
 def _seed(dataset: Dataset) -> str:
     return str(dataset.manifest.settings.get("seed", ""))
-
-
-def _fraction(seed: int, ref: BlockRef) -> float:
-    """Return a number in [0, 1) that depends on the seed and the block's identity alone."""
-    digest = hashlib.sha256(f"held back/{seed}/{ref.key}".encode()).digest()
-    return int.from_bytes(digest[:6], "little") / 2**48
 
 
 def _one_line(error: BaseException) -> str:

@@ -17,8 +17,8 @@ import numpy as np
 
 from graspq.datasets.batch import EpisodeBatch, Int64, TransitionBatch
 from graspq.datasets.blocks import BlockArrays, row_bytes
-from graspq.datasets.dataset import ShardPool
 from graspq.datasets.gather import Blocks, gather_episodes, gather_transitions, located
+from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
 
 B = TypeVar("B")

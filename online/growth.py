@@ -24,8 +24,9 @@ from graspq.datagen.settings import CollectionSettings
 from graspq.datagen.workers import BlockJob, PolicyMaker, collect_blocks
 from graspq.datasets.blocks import BlockRef
 from graspq.datasets.card import write_card
-from graspq.datasets.dataset import Dataset, ShardPool
+from graspq.datasets.dataset import Dataset
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from graspq.datasets.pool import ShardPool
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.objects.object_set import ObjectSet
 from graspq.online.plan import Plan

@@ -7,7 +7,7 @@ import dataclasses
 from pathlib import Path
 
 from graspq.datasets.blocks import BlockArrays, BlockRef, row_bytes
-from graspq.datasets.dataset import ShardPool
+from graspq.datasets.pool import ShardPool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

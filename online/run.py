@@ -11,8 +11,9 @@ import click
 
 from graspq.common.errors import UserError
 from graspq.common.seeding import generator
-from graspq.datasets.dataset import ShardPool, open_shards
+from graspq.datasets.dataset import open_shards
 from graspq.datasets.manifest import ShardEntry
+from graspq.datasets.pool import ShardPool
 from graspq.evaluate.object_sets import find_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.online.growth import GrowingDataset
@@ -60,9 +61,8 @@ def run_online(plan: Plan, *, show_progress: bool = False) -> Run:
 
 def _objects(plan: Plan, task: TaskSettings, pool: ShardPool) -> ObjectSet:
     """Return the object set, after drawing from it once so that a wrong one fails now."""
-    folders = dict.fromkeys(ref.path.absolute().parent.parent for ref in pool.blocks)
     wanted = str(pool.object_set["sha256"])
-    objects = find_object_set(task.name, plan.online.objects, wanted, folders)
+    objects = find_object_set(task.name, plan.online.objects, wanted, pool.folders)
     draw_objects(task, objects, "train", generator("online/check"))
     return objects
 

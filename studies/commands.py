@@ -122,8 +122,8 @@ def check_data(folder: Path, plan: Plan) -> None:
     from graspq.evaluate.settings import EvalSettings
 
     pool = open_shards(plan.shards, verify=False)
-    beside = (ref.path.parent.parent / "objects" for ref in pool.blocks)
-    own = next((path for path in dict.fromkeys(beside) if (path / SET_FILE).is_file()), None)
+    beside = (folder / "objects" for folder in pool.folders)
+    own = next((path for path in beside if (path / SET_FILE).is_file()), None)
     objects = Path(plan.objects) if plan.objects is not None else own
     prepare(Evaluation(None, RANDOM, pool.task["name"], plan.split, objects=objects), EvalSettings(policy=(RANDOM,)))
     for job in [] if plan.on_policy else plan.jobs:

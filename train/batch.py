@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.dataset import ShardPool
+from graspq.datasets.pool import ShardPool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,6 +45,13 @@ class Batch:
     def real_steps(self) -> Tensor:
         """Number of steps that are no padding, a scalar."""
         return torch.tensor(self.step.numel(), device=self.step.device) if self.mask is None else self.mask.sum()
+
+    @property
+    def next_states(self) -> tuple[Tensor, Tensor]:
+        """Images uint8 [B T, H, W, C] and steps int64 [B T] of s'; a ValueError where the loader left them out."""
+        if self.next_image is None or self.next_step is None:
+            raise ValueError("a bootstrapped target needs next_image and next_step in the batch")
+        return self.next_image.flatten(0, 1), self.next_step.flatten()
 
     def real(self, values: Tensor) -> Tensor:
         """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""

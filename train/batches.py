@@ -12,8 +12,8 @@ from typing import Literal
 import torch
 
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.dataset import ShardPool
 from graspq.datasets.loader import EpisodeLoader, TransitionLoader, episode_batches, transition_batches
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch, episodes_of_a_batch, to_tensors
 from graspq.train.distributed import ALONE, Ranks
 from graspq.train.estimators import Estimator

@@ -26,13 +26,14 @@ Limits: errors are measured on the data that are trained on, not on held-back on
 outcomes by heart, e is 0 and both targets are the same. Squared errors of a cell stand for all of its states.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from graspq.datasets.dataset import ShardPool
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
+from graspq.train.corrected import Judged, judged, later_steps
 from graspq.train.updates import descend, loss_of
 
 if TYPE_CHECKING:
@@ -76,36 +77,6 @@ def blended(
         mixed = (1 - weight[:, t]) * value[:, t] + weight[:, t] * (y - advantage[:, t])
         following = torch.where(real[:, t], mixed, torch.zeros_like(mixed))
     return result
-
-
-class Judged(NamedTuple):
-    """What the lagged network says of a batch's later steps; float32 [B, T], NaN elsewhere.
-
-    `value` is V = max(Q_θ'(s_t, a_t), maxᵢ Q_θ'(s_t, uᵢ)) with uniform uᵢ, as for `corr-mc`; `q` is Q_θ'(s_t, a_t).
-    """
-
-    value: Tensor
-    q: Tensor
-
-
-def judged(batch: Batch, context: "Context") -> Judged:
-    """Return V and Q of the later steps by the lagged network, whose trunk runs once for each."""
-    value, q = torch.full_like(batch.reward, torch.nan), torch.full_like(batch.reward, torch.nan)
-    later = later_steps(batch)
-    if bool(later.any()):
-        q_of_actions = context.lagged.at(batch.image[later], batch.step[later])
-        logged = batch.action[later].unsqueeze(1)
-        drawn = context.candidate_actions(later, logged.shape[-1])
-        candidates = q_of_actions(torch.cat([logged, drawn], dim=1)).float()
-        q[later], value[later] = candidates[:, 0], candidates.amax(1)
-    return Judged(value, q)
-
-
-def later_steps(batch: Batch) -> Tensor:
-    """Return which steps are real and not the first of their episode; bool [B, T]."""
-    later = torch.ones_like(batch.terminal) if batch.mask is None else batch.mask.clone()
-    later[:, 0] = False
-    return later
 
 
 def nothing_measured(pool: ShardPool) -> dict[str, Tensor]:

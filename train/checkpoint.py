@@ -85,7 +85,7 @@ def load_checkpoint(checkpoint: Path, state: TrainState, specification: NetworkS
         moments = read_tensors(checkpoint, description, f"optimizer-{part}")
         _restore_moments(optimizer, state.learned[part], moments)
     for name, tensor in read_tensors(checkpoint, description, "extra").items():
-        state.extra[name] = tensor.to(state.extra[name].device) if name in state.extra else tensor
+        state.extra[name] = tensor.to(state.device)
     state.step = int(description["step"])
 
 

@@ -1,7 +1,7 @@
 """`corr-mc`: the return that the episode really had, plus what its later actions were worse than the best ones by.
 
 Advantages come from the lagged network, whose trunk runs once for each state. Dimensions: B batch, T steps, A action,
-N candidates, n real steps after the first of their episode.
+N candidates.
 
 Differs:
 1. V(s) is the lagged network's maximum over N uniform actions and the logged one. Thus no advantage is above 0, as none
@@ -16,6 +16,8 @@ Differs:
 6. A batch holds so many whole episodes that it has `--batch-size` transitions on average.
 7. The learning rate is that of all estimators; the released code's is 1e-4 for this one alone.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,25 +43,46 @@ def annealed(progress: float, part: float) -> float:
 
 
 def sampled_advantage(batch: Batch, context: Context) -> Tensor:
-    """Return how much worse than the best candidate each logged action is, by the lagged network.
+    """Return how much worse than the best candidate each logged action is, by the lagged network; see `judged`.
 
-        A(s_t, a_t) = Q_θ'(s_t, a_t) - max_{a ∈ {a_t, u₁ .. u_N}} Q_θ'(s_t, a) ≤ 0,  uᵢ ~ U[-1, 1]ᴬ
-
-    Args:
-        batch: whole episodes.
-        context: gives θ', N and the random numbers.
+        A(s_t, a_t) = Q_θ'(s_t, a_t) - V(s_t) ≤ 0
 
     Returns:
         float32 [B, T]; NaN at first steps, whose advantage no target reads, and on padding.
     """
-    wanted = torch.ones_like(batch.terminal) if batch.mask is None else batch.mask.clone()
-    wanted[:, 0] = False
-    advantage = torch.full_like(batch.reward, torch.nan)
-    if not bool(wanted.any()):
-        return advantage
-    q_of_actions = context.lagged.at(batch.image[wanted], batch.step[wanted])
-    logged = batch.action[wanted].unsqueeze(1)
-    drawn = context.candidate_actions(wanted, logged.shape[-1])
-    q = q_of_actions(torch.cat([logged, drawn], dim=1)).float()
-    advantage[wanted] = q[:, 0] - q.amax(1)
-    return advantage
+    seen = judged(batch, context)
+    return seen.q - seen.value
+
+
+class Judged(NamedTuple):
+    """What the lagged network says of a batch's later steps; float32 [B, T], NaN elsewhere."""
+
+    value: Tensor
+    q: Tensor
+
+
+def judged(batch: Batch, context: Context) -> Judged:
+    """Return V and Q of the later steps by the lagged network, whose trunk runs once for each.
+
+        V(s_t) = max_{a ∈ {a_t, u₁ .. u_N}} Q_θ'(s_t, a),  uᵢ ~ U[-1, 1]ᴬ
+
+    Args:
+        batch: whole episodes.
+        context: gives θ', N and the random numbers.
+    """
+    value, q = torch.full_like(batch.reward, torch.nan), torch.full_like(batch.reward, torch.nan)
+    later = later_steps(batch)
+    if bool(later.any()):
+        q_of_actions = context.lagged.at(batch.image[later], batch.step[later])
+        logged = batch.action[later].unsqueeze(1)
+        drawn = context.candidate_actions(later, logged.shape[-1])
+        candidates = q_of_actions(torch.cat([logged, drawn], dim=1)).float()
+        q[later], value[later] = candidates[:, 0], candidates.amax(1)
+    return Judged(value, q)
+
+
+def later_steps(batch: Batch) -> Tensor:
+    """Return which steps are real and not the first of their episode; bool [B, T]."""
+    later = torch.ones_like(batch.terminal) if batch.mask is None else batch.mask.clone()
+    later[:, 0] = False
+    return later

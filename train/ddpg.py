@@ -40,9 +40,7 @@ def lagged_actor_target(batch: Batch, context: "Context") -> Tensor:
 
     Source: Quillen et al. 2018, section "Deep Deterministic Policy Gradient".
     """
-    if batch.next_image is None or batch.next_step is None:
-        raise ValueError("a bootstrapped target needs next_image and next_step in the batch")
-    image, step = batch.next_image.flatten(0, 1), batch.next_step.flatten()
+    image, step = batch.next_states
     action = pointed(context.lagged_networks["actor"](image, step)).clamp(-1, 1)
     next_value = context.lagged.at(image, step)(action.unsqueeze(1)).squeeze(1)
     return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), context.discount)

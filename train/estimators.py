@@ -18,7 +18,7 @@ from torch import Tensor
 
 from graspq.common.errors import UserError
 from graspq.common.named_objects import named_module
-from graspq.datasets.dataset import ShardPool
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.blend import blended_target, measured_regression, nothing_measured
 from graspq.train.corrected import corrected_target
@@ -26,7 +26,7 @@ from graspq.train.ddpg import actor_critic, lagged_actor_target
 from graspq.train.pcl import consistent_value, first_penalty, path_consistency, residual
 from graspq.train.selection import uniform_search
 from graspq.train.state import Context, Parts
-from graspq.train.supervised import measured_motions, outcome_target, q_of_synthetic, synthetic_action
+from graspq.train.supervised import measured_motions, synthetic_action
 from graspq.train.targets import bootstrapped, episode_value
 from graspq.train.updates import Objective, Update, regression, regression_objective
 
@@ -38,12 +38,6 @@ Acting = Literal["search", "synthetic search", "actor"]
 def logged_action(batch: Batch) -> Tensor:
     """Return the actions that were taken; float32 [B, T, A]."""
     return batch.action
-
-
-def q_of_logged(batch: Batch, context: Context) -> Tensor:
-    """Return Q_θ(s_t, a_t) of every real step's logged action, on the scale of returns; float32 [n]."""
-    q_of_actions = context.network.at(batch.real(batch.image), batch.real(batch.step))
-    return q_of_actions(batch.real(batch.action).unsqueeze(1)).squeeze(1).float()
 
 
 def nothing_more(pool: ShardPool) -> dict[str, Tensor]:
@@ -68,8 +62,6 @@ class Estimator:
         action: the action whose Q is regressed onto the target; float [B, T, A].
         update: one step of training.
         objective: the loss that validation reports, mean over a batch; called without gradient, in evaluation mode.
-        score: Q of every real step's action as a chance of success, float [n], for calibration and ROC AUC; None where
-            the estimator has no Q.
         parts: its networks and their numbers of outputs.
         acting: how its policy finds an action.
         extra: training data -> tensors that are kept in `TrainState.extra` from the start.
@@ -85,7 +77,6 @@ class Estimator:
     action: Callable[[Batch], Tensor] = logged_action
     update: Update = regression
     objective: Objective = regression_objective
-    score: Callable[[Batch, Context], Tensor] | None = q_of_logged
     parts: Parts = dataclasses.field(default_factory=lambda: {"q": 1})
     acting: Acting = "search"
     extra: Callable[[ShardPool], dict[str, Tensor]] = nothing_more
@@ -111,7 +102,7 @@ class Estimator:
 
 
 def monte_carlo_target(batch: Batch, context: Context) -> Tensor:
-    """Return the observed return; see `targets.episode_value`.
+    """Return the observed return; see `targets.episode_value`. For `supervised`, without discount, it is the outcome.
 
     Source: Quillen et al. 2018, section "Regression with Monte Carlo Return Estimates".
     Differs: 1. No discount by default, as the paper's footnote and its code have it; its formula has one. With
@@ -129,9 +120,7 @@ def double_q_target(batch: Batch, context: Context) -> Tensor:
     Differs: 1. The lagged network runs with the running statistics of batch normalisation that it was copied with; the
     paper's network has none.
     """
-    if batch.next_image is None or batch.next_step is None:
-        raise ValueError("a bootstrapped target needs next_image and next_step in the batch")
-    image, step = batch.next_image.flatten(0, 1), batch.next_step.flatten()
+    image, step = batch.next_states
     drawn = context.candidate_actions(torch.ones_like(batch.terminal), batch.action.shape[-1])
     best = uniform_search(context.network.at(image, step), drawn)
     next_value = context.lagged.at(image, step)(best.action.unsqueeze(1)).squeeze(1)
@@ -146,9 +135,8 @@ ESTIMATORS: dict[str, Estimator] = {
         view="transitions",
         needs_next=False,
         discount=1.0,
-        target=outcome_target,
+        target=monte_carlo_target,
         action=synthetic_action,
-        score=q_of_synthetic,
         acting="synthetic search",
         extra=measured_motions,
         takes_discount=False,
@@ -202,7 +190,6 @@ ESTIMATORS: dict[str, Estimator] = {
         target=consistent_value,
         update=path_consistency,
         objective=residual,
-        score=None,
         parts={"v": 1, "actor": 8},
         acting="actor",
         extra=first_penalty,

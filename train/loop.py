@@ -17,7 +17,8 @@ from torch import Tensor
 
 from graspq.common.errors import UserError
 from graspq.common.provenance import code_revision, versions
-from graspq.datasets.dataset import ShardPool, open_shards
+from graspq.datasets.dataset import open_shards
+from graspq.datasets.pool import ShardPool
 from graspq.train.augment import Augmentation
 from graspq.train.batch import Batch
 from graspq.train.batches import batch_rows, held_back_batches, training_batches
@@ -99,7 +100,7 @@ def session(
         settings.network, pool.image_shape, ACTIONS, pool.max_steps, LINKS[settings.loss], settings.width
     )
     device = chosen_device(settings.device)
-    state = new_state(specification, settings, device, estimator.parts, estimator.extra(training))
+    state = new_state(specification, settings, device, estimator.parts)
     if ranks.first and discount != pool.discount and (estimator.discount is None or not estimator.takes_discount):
         stored = f"the data's are of discount {pool.discount:g}"
         click.echo(f"{settings.algo}: returns are made from the rewards with discount {discount:g}; {stored}", err=True)
@@ -111,6 +112,9 @@ def session(
         loaded = newest if newest is not None else start
         if loaded is not None:
             load_checkpoint(loaded, state, specification)
+        else:
+            # A new run alone: what reads all the data is not done again at every start.
+            state.extra = {name: tensor.to(device) for name, tensor in estimator.extra(training).items()}
         run.forget_after(state.step)
         ranks.spread(state.tensors)
         unite(state.learned.values(), state.optimizers.values(), ranks)

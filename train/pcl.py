@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from graspq.datasets.dataset import ShardPool
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.selection import pointed
 from graspq.train.targets import path_consistent

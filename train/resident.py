@@ -15,8 +15,8 @@ from torch import Tensor
 from graspq.common.errors import UserError
 from graspq.datasets.batch import Int64
 from graspq.datasets.blocks import BlockArrays
-from graspq.datasets.dataset import ShardPool
 from graspq.datasets.loader import READERS
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 
 COLUMNS = ("step", "action", "reward", "terminal", "mc_return", "synthetic_action")

@@ -52,6 +52,11 @@ class TrainState:
     parts: Parts
 
     @property
+    def device(self) -> torch.device:
+        """Where everything lies."""
+        return next(parameter.device for network in self.learned.values() for parameter in network.parameters())
+
+    @property
     def acting(self) -> Networks:
         """The networks that policies and validation use."""
         return self.averaged or self.learned
@@ -160,16 +165,14 @@ def new_state(
     settings: "TrainSettings",
     device: torch.device,
     parts: Parts,
-    extra: dict[str, Tensor] | None = None,
 ) -> TrainState:
-    """Return the state before the first step.
+    """Return the state before the first step, with nothing in `extra` yet.
 
     Args:
         specification: of all networks.
         settings: of the run.
         device: where everything lies.
         parts: the networks of the estimator.
-        extra: what the estimator keeps besides.
     """
     learned: Networks = {
         part: make_part(part, specification, outputs, seeded(f"train/weights/{part}", settings.seed)).to(device)
@@ -181,7 +184,7 @@ def new_state(
         lagged=_frozen_copies(learned),
         averaged=_frozen_copies(learned) if settings.average_decay > 0 else {},
         optimizers={part: _optimizer(network, settings) for part, network in learned.items()},
-        extra={name: tensor.to(device) for name, tensor in (extra or {}).items()},
+        extra={},
         parts=dict(parts),
     )
 

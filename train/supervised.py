@@ -1,7 +1,7 @@
 """`supervised`: the outcome of the episode, regressed on the motion that would have led from a pose to the last one.
 
 What a policy needs besides the network, where that motion may lie at each step, is measured in the training data.
-Dimensions: B batch, T steps, A action, n real steps.
+Dimensions: B batch, T steps, A action.
 
 Differs:
 1. A motion spans several steps; the paper does not say how it becomes one. Here the policy searches whole motions, as
@@ -19,33 +19,20 @@ Differs:
 import torch
 from torch import Tensor
 
-from graspq.datasets.dataset import ShardPool
+from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.selection import SearchSpace
-from graspq.train.state import Context
-from graspq.train.targets import episode_value
 
 PREFIX = "synthetic_"
 
 
-def outcome_target(batch: Batch, context: Context) -> Tensor:
-    """Return the outcome of the whole episode at each of its steps: the observed return without discount; [B, T].
+def synthetic_action(batch: Batch) -> Tensor:
+    """Return final pose minus current pose in units of the action limits; float32 [B, T, A].
 
     Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning".
     Differs: see the list of the module.
     """
-    return episode_value(batch.mc_return)
-
-
-def synthetic_action(batch: Batch) -> Tensor:
-    """Return final pose minus current pose in units of the action limits; float32 [B, T, A]."""
     return batch.synthetic_action
-
-
-def q_of_synthetic(batch: Batch, context: Context) -> Tensor:
-    """Return Q_θ(s_t, p_T - p_t) of every real step, a chance of success; float32 [n]."""
-    q_of_actions = context.network.at(batch.real(batch.image), batch.real(batch.step))
-    return q_of_actions(batch.real(batch.synthetic_action).unsqueeze(1)).squeeze(1).float()
 
 
 def measured_motions(pool: ShardPool) -> dict[str, Tensor]:

@@ -56,14 +56,16 @@ def validate(batches: Iterable[Batch], estimator: Estimator, context: Context) -
     total, count, last_steps = 0.0, 0, 0
     scores, rewards = [], []
     for batch in batches:
-        size = int(batch.step.numel() if batch.mask is None else batch.mask.sum())
+        size = int(batch.real_steps)
         total += float(estimator.objective(batch, estimator, context)) * size
         count += size
         last = batch.real(batch.terminal)
         last_steps += int(last.sum())
-        if estimator.score is not None:
+        if "q" in estimator.parts:
             with context.autocast():
-                scores.append(estimator.score(batch, context)[last].float().cpu().numpy())
+                q_at_last = context.network.at(batch.real(batch.image)[last], batch.real(batch.step)[last])
+                score = q_at_last(batch.real(estimator.action(batch))[last].unsqueeze(1)).squeeze(1)
+            scores.append(score.float().cpu().numpy())
             rewards.append(batch.real(batch.reward)[last].cpu().numpy())
     if count == 0:
         return None

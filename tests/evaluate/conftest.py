@@ -1,7 +1,7 @@
 """A small but real world: procedural objects, grasps from the simulator in a dataset, and a run trained on it."""
 
 import os
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,36 +22,14 @@ def objects_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def dataset(objects_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Grasps of the random policy, collected and written as grasp-datagen does, with the object set beside them."""
-    from graspq.datagen.collect import collect_block
-    from graspq.datagen.settings import CollectionSettings
-    from graspq.datasets.manifest import Manifest
-    from graspq.datasets.writer import commit_shard, write_shard
+def dataset(
+    collect_regular: Callable[..., Path], objects_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Grasps of the random policy, with the object set beside them."""
     from graspq.objects.object_set import ObjectSet
-    from graspq.sim.episode import GraspSimulation
-    from graspq.sim.task import task_settings
 
     folder = tmp_path_factory.mktemp("data") / "regular"
-    objects, task = ObjectSet.load(objects_folder), task_settings("regular")
-    settings = replace(CollectionSettings(), block_size=BLOCK_SIZE)
-    manifest = Manifest(
-        task=task.to_json(),
-        settings=settings.described(),
-        versions={},
-        object_set={"name": objects.name, "sha256": objects.digest()},
-        image_shape=(task.image_size, task.image_size, 3),
-        action_limits=task.action_limits,
-        discount=1.0,
-        phi_range=(-task.phi_limit, task.phi_limit),
-    )
-    objects.copy_to(folder / "objects")
-    with GraspSimulation(task, objects) as simulation:
-        blocks = [collect_block(simulation, settings, block, BLOCK_SIZE) for block in range(BLOCKS)]
-    episodes = [episode for block in blocks for episode in block]
-    manifest.save(folder)
-    commit_shard(folder, manifest, write_shard(folder, manifest, 0, BLOCKS, episodes))
-    return folder
+    return collect_regular(folder, ObjectSet.load(objects_folder), BLOCKS, BLOCK_SIZE)
 
 
 @pytest.fixture(scope="session")

@@ -1,22 +1,15 @@
 """A small but real on-policy world: forty random grasps, a run of six steps on them, and plans that go on from it."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from graspq.datagen.collect import collect_block
-from graspq.datagen.run import describe
-from graspq.datagen.settings import CollectionSettings, DatagenSettings
-from graspq.datasets.writer import commit_shard, write_shard
 from graspq.objects.object_set import ObjectSet
 from graspq.online.plan import Plan, resolve
 from graspq.online.settings import OnlineOptions
-from graspq.sim.episode import GraspSimulation
-from graspq.sim.task import TASKS
 from graspq.train.loop import train
 from graspq.train.settings import preset_settings
 
@@ -30,17 +23,11 @@ def one_thread() -> None:
 
 
 @pytest.fixture(scope="session")
-def base(regular_objects: ObjectSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def base(
+    collect_regular: Callable[..., Path], regular_objects: ObjectSet, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """Forty grasps of the random policy, with the object set beside them."""
-    folder, task = tmp_path_factory.mktemp("data") / "base", TASKS["regular"]
-    settings = replace(CollectionSettings(), block_size=BLOCK_SIZE)
-    manifest = replace(describe(DatagenSettings(), task, regular_objects), settings=settings.described())
-    regular_objects.copy_to(folder / "objects")
-    with GraspSimulation(task, regular_objects) as simulation:
-        blocks = [collect_block(simulation, settings, block, BLOCK_SIZE) for block in range(BLOCKS)]
-    manifest.save(folder)
-    commit_shard(folder, manifest, write_shard(folder, manifest, 0, BLOCKS, [one for block in blocks for one in block]))
-    return folder
+    return collect_regular(tmp_path_factory.mktemp("data") / "base", regular_objects, BLOCKS, BLOCK_SIZE)
 
 
 @pytest.fixture(scope="session")

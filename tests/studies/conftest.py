@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,30 +65,8 @@ def write() -> Any:
 
 
 @pytest.fixture(scope="session")
-def dataset(regular_objects: ObjectSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve grasps of the random policy, collected and written as grasp-datagen does."""
-    from graspq.datagen.collect import collect_block
-    from graspq.datagen.settings import CollectionSettings
-    from graspq.datasets.manifest import Manifest
-    from graspq.datasets.writer import commit_shard, write_shard
-    from graspq.sim.episode import GraspSimulation
-    from graspq.sim.task import task_settings
-
-    folder, task = tmp_path_factory.mktemp("data") / "regular", task_settings("regular")
-    settings = replace(CollectionSettings(), block_size=3)
-    manifest = Manifest(
-        task=task.to_json(),
-        settings=settings.described(),
-        versions={},
-        object_set={"name": regular_objects.name, "sha256": regular_objects.digest()},
-        image_shape=(task.image_size, task.image_size, 3),
-        action_limits=task.action_limits,
-        discount=1.0,
-        phi_range=(-task.phi_limit, task.phi_limit),
-    )
-    regular_objects.copy_to(folder / "objects")
-    with GraspSimulation(task, regular_objects) as simulation:
-        blocks = [collect_block(simulation, settings, block, 3) for block in range(4)]
-    manifest.save(folder)
-    commit_shard(folder, manifest, write_shard(folder, manifest, 0, 4, [one for block in blocks for one in block]))
-    return folder
+def dataset(
+    collect_regular: Callable[..., Path], regular_objects: ObjectSet, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Twelve grasps of the random policy."""
+    return collect_regular(tmp_path_factory.mktemp("data") / "regular", regular_objects, 4, 3)

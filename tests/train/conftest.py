@@ -20,7 +20,7 @@ from graspq.datasets.manifest import Manifest
 from graspq.datasets.writer import commit_shard, write_shard
 from graspq.train.settings import TrainSettings, preset_settings
 
-# For `tiny_mdp` and `tiny_training`, which hold no tests.
+# For `plain_context`, `tiny_mdp` and `tiny_training`, which hold no tests.
 sys.path.append(str(Path(__file__).parent))
 SIZE, BLOCK = 16, 10
 GREY = {"A": 60, "B": 190}

@@ -1,9 +1,8 @@
 """`corr-mc` on Q-functions whose values are known: its advantages, its annealing, and the bias of what it does."""
 
-import contextlib
-
 import pytest
 import torch
+from plain_context import plain_context
 from torch import Tensor
 
 from graspq.train.batch import Batch
@@ -35,17 +34,8 @@ class Peak(QNetwork):
 
 
 def context(lagged: QNetwork, *, progress: float = 1.0, candidates: int = 16) -> Context:
-    return Context(
-        networks={"q": Peak()},
-        lagged_networks={"q": lagged},
-        loss="cross-entropy",
-        discount=0.9,
-        candidates=candidates,
-        generator=seeded("tests/draws"),
-        progress=progress,
-        autocast=contextlib.nullcontext,
-        extra={},
-        anneal=0.5,
+    return plain_context(
+        {"q": Peak()}, {"q": lagged}, loss="cross-entropy", candidates=candidates, progress=progress, anneal=0.5
     )
 
 

@@ -3,12 +3,12 @@
 That actor and critic reach the best policy of a known decision process stands in `test_learning`.
 """
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from plain_context import plain_context
 from torch import Tensor, nn
 
 from graspq.train.batch import Batch
@@ -19,7 +19,6 @@ from graspq.train.loop import train
 from graspq.train.networks import Features, QNetwork, StateNetwork
 from graspq.train.selection import pointed
 from graspq.train.settings import TrainSettings
-from graspq.train.state import Context, seeded
 from graspq.train.updates import descend
 
 
@@ -74,16 +73,9 @@ def test_an_output_of_zero_points_straight_down_and_no_output_points_far_outside
 
 
 def test_the_target_judges_the_lagged_actors_action_by_the_lagged_critic_and_clips_it() -> None:
-    context = Context(
-        networks={"q": Product(-50.0), "actor": Says(-0.5, 0.0, 0.0, 0.0)},
-        lagged_networks={"q": Product(2.0), "actor": Says(1.2, 0.0, 0.0, 0.0)},
-        loss="squared",
-        discount=0.9,
-        candidates=16,
-        generator=seeded("tests/ddpg"),
-        progress=0.0,
-        autocast=contextlib.nullcontext,
-        extra={},
+    context = plain_context(
+        {"q": Product(-50.0), "actor": Says(-0.5, 0.0, 0.0, 0.0)},
+        {"q": Product(2.0), "actor": Says(1.2, 0.0, 0.0, 0.0)},
     )
     target = lagged_actor_target(batch(), context)
     torch.testing.assert_close(target, torch.tensor([[0.9 * (2.0 + 1.0)], [1.0]]))

@@ -1,12 +1,12 @@
 """The table of estimators, and the double-Q target on Q-functions whose values are known."""
 
-import contextlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from plain_context import plain_context
 from torch import Tensor
 
 from graspq.common.errors import UserError
@@ -38,17 +38,7 @@ class Slope(QNetwork):
 
 
 def context(network: QNetwork, lagged: QNetwork) -> Context:
-    return Context(
-        networks={"q": network},
-        lagged_networks={"q": lagged},
-        loss="squared",
-        discount=0.9,
-        candidates=16,
-        generator=seeded("tests/draws"),
-        progress=0.0,
-        autocast=contextlib.nullcontext,
-        extra={},
-    )
+    return plain_context({"q": network}, {"q": lagged})
 
 
 def batch() -> Batch:

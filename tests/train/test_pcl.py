@@ -3,11 +3,11 @@
 That `pcl` reaches the regularised optimum of a known decision process stands in `test_learning`.
 """
 
-import contextlib
 import math
 
 import pytest
 import torch
+from plain_context import plain_context
 from torch import Tensor, nn
 
 from graspq.train.batch import Batch
@@ -97,15 +97,10 @@ class Outputs(StateNetwork):
 
 
 def context(actor: Tensor, lagged: Tensor, value: Tensor, penalty: float | None) -> Context:
-    return Context(
-        networks={"actor": Outputs(actor), "v": Outputs(value)},
-        lagged_networks={"actor": Outputs(lagged), "v": Outputs(value)},
+    return plain_context(
+        {"actor": Outputs(actor), "v": Outputs(value)},
+        {"actor": Outputs(lagged), "v": Outputs(value)},
         loss="cross-entropy",
-        discount=0.9,
-        candidates=16,
-        generator=seeded("tests/pcl"),
-        progress=0.0,
-        autocast=contextlib.nullcontext,
         extra={"penalty": torch.tensor(0.25)},
         penalty=penalty,
     )

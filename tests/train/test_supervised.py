@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from graspq.datasets.dataset import ShardPool, open_shards
+from graspq.datasets.dataset import open_shards
+from graspq.datasets.pool import ShardPool
 from graspq.train.checkpoint import load_acting
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.loop import train

@@ -82,8 +82,8 @@ def fit(row: Estimator, data: Data, settings: TrainSettings) -> TrainState:
         settings: steps, batch size (transitions), learning rate, loss and so on.
     """
     specification = NetworkSpecification("tiny", (SIZE, SIZE, 3), 4, STEPS, LINKS[settings.loss])
-    extra = row.extra(data)  # type: ignore[arg-type]
-    state = new_state(specification, settings, torch.device("cpu"), row.parts, extra)
+    state = new_state(specification, settings, torch.device("cpu"), row.parts)
+    state.extra = row.extra(data)  # type: ignore[arg-type]
     while state.step < settings.steps:
         generator = seeded("tests/tiny", settings.seed, state.step)
         if row.view == "episodes":
