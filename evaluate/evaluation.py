@@ -20,7 +20,7 @@ from graspq.common.provenance import code_revision, versions
 from graspq.evaluate.films import write_films
 from graspq.evaluate.jobs import Job
 from graspq.evaluate.object_sets import find_object_set
-from graspq.evaluate.policies import CEM, ORACLE, RANDOM, Policy, RandomObservationPolicy, UserPolicy
+from graspq.evaluate.policies import ACTOR, CEM, ORACLE, RANDOM, Policy, RandomObservationPolicy, UserPolicy
 from graspq.evaluate.records import (
     EPISODES_FILE,
     FORMAT_VERSION,
@@ -215,6 +215,7 @@ def stage_of(prepared: Prepared) -> Any:
 
 def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
     job, facts = prepared.job, prepared.facts
+    search = prepared.identity.get("cem")
     successes = sum(row.success for row in rows)
     return {
         "format_version": FORMAT_VERSION,
@@ -228,13 +229,13 @@ def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "mean_steps": float(np.mean([row.steps for row in rows])),
         "mean_return": float(np.mean([row.episode_return for row in rows])),
         "ends": {end: sum(row.end == end for row in rows) for end in ("height", "T")},
-        "policy": job.policy or CEM,
+        "policy": job.policy or (CEM if search is not None else ACTOR),
         "run": job.run.as_posix() if job.run is not None else None,
         "algo": facts.algo if facts is not None else None,
         "checkpoint_step": facts.step if facts is not None else None,
         "seed": job.seed,
         "object_set": {"name": prepared.objects.name, "sha256": prepared.objects.digest()},
-        "cem": job.cem.to_json() if job.run is not None else None,
+        "cem": search,
         "command": command_of(job),
         "versions": versions(*PACKAGES),
         "code_revision": code_revision(),

@@ -20,7 +20,7 @@ from graspq.common.seeding import generator
 from graspq.evaluate.settings import CemSettings, Device
 
 ORACLE, RANDOM = "oracle", "random"
-CEM = "cem"  # what eval.json calls the policy of a run
+CEM, ACTOR = "cem", "actor"  # what eval.json calls the policies of runs
 ACTION_DIMENSIONS = 4
 _ROUNDING = 1e-5  # a float32 action may lie this far outside [-1, 1]
 

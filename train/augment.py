@@ -105,6 +105,12 @@ def mirrored_action(action: Tensor, mirrored: Tensor) -> Tensor:
     return torch.where(mirrored.view(-1, 1, 1), action * sign, action)
 
 
+def mirror_image(image: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Return states and candidate actions in the mirror: uint8 [n, H, W, C] and float [n, N, A], as they were given."""
+    everything = torch.ones(len(action), dtype=torch.bool, device=action.device)
+    return image.flip(2), mirrored_action(action, everything)
+
+
 def jittered(image: Tensor, contrast: Tensor, brightness: Tensor) -> Tensor:
     """Return clamp(contrast · (image - 128) + 128 + brightness, 0, 255), for uint8 [B, T, H, W, C] and float [B]."""
     shape = (-1, 1, 1, 1, 1)

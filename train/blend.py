@@ -33,7 +33,8 @@ from torch import Tensor
 
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
-from graspq.train.corrected import Judged, judged, later_steps
+from graspq.train.corrected import Judged, advantages, judged, later_steps
+from graspq.train.targets import corrected_episode_value
 from graspq.train.updates import descend, loss_of
 
 if TYPE_CHECKING:
@@ -122,28 +123,30 @@ def weights(extra: dict[str, Tensor]) -> Tensor:
 
 def blended_target(batch: Batch, context: "Context") -> Tensor:
     """Return the targets with λ as it was measured so far; float [B, T]."""
-    return _target(batch, context, judged(batch, context))
+    seen = judged(batch, context)
+    return _target(batch, context, seen, advantages(batch, seen, 1.0, context))
 
 
-def _target(batch: Batch, context: "Context", seen: Judged) -> Tensor:
+def _target(batch: Batch, context: "Context", seen: Judged, advantage: Tensor) -> Tensor:
     later = later_steps(batch)
     weight = torch.zeros_like(batch.reward)
     weight[later] = weights(context.extra).to(weight.dtype)[cell_of(batch.step[later], seen.q[later])]
-    return blended(batch.reward, seen.value, seen.q - seen.value, weight, context.discount, batch.mask)
+    return blended(batch.reward, seen.value, advantage, weight, context.discount, batch.mask)
 
 
 def measured_regression(state: "TrainState", batch: Batch, estimator: "Estimator", context: "Context") -> Tensor:
     """Measure the lagged network's errors on a batch, then take one step of regression onto the blended targets."""
     q = state.learned["q"]
+    q.eval()
     with torch.no_grad(), context.autocast():
         seen = judged(batch, context)
+        advantage = advantages(batch, seen, 1.0, context)
         later = later_steps(batch)
-        whole = torch.ones_like(batch.reward)
-        corrected = blended(batch.reward, seen.value, seen.q - seen.value, whole, context.discount, batch.mask)
+        corrected = corrected_episode_value(batch.reward, advantage, 1.0, context.discount, batch.mask)
         errors = state.extra["blend_errors"]
         new = summed(cell_of(batch.step[later], seen.q[later]), (corrected - seen.q)[later], errors.shape[1])
         errors.mul_(DECAY).add_(context.part.ranks.sum(new))
-        target = batch.real(_target(batch, context, seen)).float()
+        target = batch.real(_target(batch, context, seen, advantage)).float()
     context.watched["target"] = target.abs().mean()
     q.train()
     loss = loss_of(batch, target, estimator, context)

@@ -41,13 +41,17 @@ class Ranks:
         dist.all_reduce(total)
         return total
 
+    def longest(self, length: int) -> int:
+        """Return the greatest length of all ranks; all wait for each other here."""
+        if self.count == 1:
+            return length
+        greatest = torch.tensor(length)
+        dist.all_reduce(greatest, dist.ReduceOp.MAX)
+        return int(greatest)
+
     def any(self, flag: bool) -> bool:
         """Return whether the flag is set on any rank; all wait for each other here."""
-        if self.count == 1:
-            return flag
-        highest = torch.tensor(int(flag))
-        dist.all_reduce(highest, dist.ReduceOp.MAX)
-        return bool(highest)
+        return bool(self.longest(int(flag)))
 
     def from_first(self, function: Callable[[], Result]) -> Result:
         """Return on every rank what the function gives on the first, which alone calls it.
@@ -129,6 +133,13 @@ class BatchPart:
         if self.ranks.count == 1:
             return value
         return self.ranks.sum(value * self.share) / self.ranks.count
+
+    def sum_by_step(self, values: Tensor) -> Tensor:
+        """Return the sum over all parts of [..., T], as long as the longest of them: parts end with their episodes."""
+        if self.ranks.count == 1:
+            return values
+        missing = self.ranks.longest(values.shape[-1]) - values.shape[-1]
+        return self.ranks.sum(torch.nn.functional.pad(values, (0, missing)))
 
 
 WHOLE = BatchPart()

@@ -229,6 +229,8 @@ class Session:
             autocast=self.precision.autocast,
             extra=self.state.extra,
             anneal=self.settings.anneal,
+            centred=self.settings.centred,
+            mirror=self.settings.mirror,
             actor_rest=self.settings.actor_rest,
             actor_rate=self.settings.actor_rate,
             path_steps=self.settings.path_steps,

@@ -32,7 +32,8 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "mirror": True,
         "jitter": 0.0,
         "action_noise": 0.0,
-        "anneal": 0.5,
+        "anneal": 1.0,
+        "centred": True,
         "actor_rest": 0.2,
         "actor_rate": 0.1,
         "path_steps": None,
@@ -55,6 +56,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "jitter": 0.0,
         "action_noise": 0.0,
         "anneal": 0.05,
+        "centred": False,
         "actor_rest": 0.0,
         "actor_rate": 1.0,
         "path_steps": 10,
@@ -122,6 +124,10 @@ class TrainSettings(Settings):
         help="Part of the steps over which the correction of corr-mc rises from 0 to 1; 0: all at once.",
         minimum=0,
         maximum=1,
+    )
+    centred: bool = _preset_setting(
+        "centred",
+        help="Shift the advantages of corr-mc and blend so that their targets agree with the lagged Q on average.",
     )
     actor_rest: float = _preset_setting(
         "actor_rest",

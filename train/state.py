@@ -95,6 +95,8 @@ class Context:
         autocast: gives the context manager under which networks run.
         extra: `TrainState.extra`.
         anneal: part of the training over which a coefficient is annealed.
+        centred: whether advantages are shifted so that targets agree with θ' on average.
+        mirror: whether what one network picks on the mirror image is judged by another on the image.
         path_steps: d of path consistency; None is the rest of the episode.
         penalty: λ of path consistency; None lets the estimator tune it to `kl_bound`.
         kl_bound: what the mean relative entropy to the lagged policy is tuned to, nats.
@@ -115,6 +117,8 @@ class Context:
     autocast: Callable[[], contextlib.AbstractContextManager[object]]
     extra: dict[str, Tensor]
     anneal: float = 0.5
+    centred: bool = False
+    mirror: bool = False
     path_steps: int | None = None
     penalty: float | None = None
     kl_bound: float = 0.02

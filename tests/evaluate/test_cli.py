@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -229,3 +230,35 @@ def test_another_object_set_than_the_runs_must_be_asked_for(
     done = command("grasp-eval", moved, *SMALL, "--plan")
     assert done.code == 2 and "not the object set of the run's data" in done.lines[0]
     assert command("grasp-eval", moved, *SMALL, "--plan", "--objects", "data/objects/regular").code == 0
+
+
+OWN_ROW = """
+import dataclasses
+from graspq.train.estimators import ESTIMATORS
+row = dataclasses.replace(ESTIMATORS["ddpg"], summary="my own")
+"""
+
+
+def test_a_run_of_a_users_own_row_is_evaluated_where_its_module_lies_and_acts_by_its_actor(
+    dataset: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from graspq.train.loop import train
+    from graspq.train.settings import preset_settings
+
+    (tmp_path / "own_rows_of_a_user.py").write_text(OWN_ROW)
+    monkeypatch.chdir(tmp_path)
+    settings = preset_settings(
+        "paper", algo="own_rows_of_a_user:row", shards=(str(dataset),), out=tmp_path / "run", steps=1, batch_size=8,
+        validation_fraction=0.0, device="cpu", precision="float32", threads=1,
+    )  # fmt: skip
+    train(settings)
+    done = command("grasp-eval", "run", *SMALL, "--out", "scores", "--films", "0")
+    assert done.code == 0, done.err
+    (row,) = [json.loads(line) for line in Path("scores/results.jsonl").read_text().splitlines()]
+    assert (row["label"], row["policy"], row["algo"]) == ("run", "actor", "own_rows_of_a_user:row")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    monkeypatch.delitem(sys.modules, "own_rows_of_a_user")
+    refused = command("grasp-eval", "../run", *SMALL, "--out", "scores")
+    assert refused.code == 2
+    assert "run it where own_rows_of_a_user is" in refused.lines[-1]

@@ -79,12 +79,16 @@ def test_the_observed_returns_have_the_mean_of_the_behaviours_exact_values(data:
         assert float(returns.mean()) == pytest.approx(exact, abs=5 * float(returns.std()) / len(returns) ** 0.5)
 
 
-@pytest.mark.parametrize("algo", ["dql", "corr-mc", "ddpg", "blend"])
-def test_bootstrapped_and_corrected_estimators_reach_the_optimal_values(algo: str, data: tiny_mdp.Data) -> None:
+# An actor is a little off the best action, and so are its targets.
+@pytest.mark.parametrize(("algo", "near"), [("dql", 0.12), ("corr-mc", 0.12), ("ddpg", NEAR), ("blend", 0.12)])
+def test_bootstrapped_and_corrected_estimators_reach_the_optimal_values(
+    algo: str, near: float, data: tiny_mdp.Data
+) -> None:
     state = learned(algo, data)
-    assert distance(state, Q_STAR) < NEAR
+    assert distance(state, Q_STAR) < near
     assert distance(state, Q_BEHAVIOUR) > GAP
-    assert distance(state, tiny_mdp.solve(tiny_mdp.largest, 0.7)) > NEAR
+    for wrong in (0.7, 1.0):
+        assert distance(state, tiny_mdp.solve(tiny_mdp.largest, wrong)) > near + 0.05
 
 
 def test_mc_reaches_the_behaviours_values_and_misses_the_optimal_ones(data: tiny_mdp.Data) -> None:

@@ -111,6 +111,8 @@ def context(state: TrainState, settings: TrainSettings, generator: torch.Generat
         progress=state.step / settings.steps,
         autocast=contextlib.nullcontext,
         anneal=settings.anneal,
+        centred=settings.centred,
+        mirror=settings.mirror,
         penalty=settings.penalty,
         extra=state.extra,
     )
