@@ -12,31 +12,14 @@ from typing import Any
 
 import click
 import torch
+from rivals import anew, tiled
 from timing import median_ratio, report, take_turns
-from torch import Tensor
 
 from graspq.train.networks import NetworkSpecification, QNetwork, make_network, make_state_network
 from graspq.train.selection import QOfActions, cem_noise, cross_entropy_method, pointed
 from graspq.train.state import seeded
 
 TOLERANCE = 1e-4
-
-
-def tiled(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
-    """Return Q of candidates [B, N, A] by the whole network on N copies of every image."""
-
-    def q_of_actions(action: Tensor) -> Tensor:
-        batch, candidates = action.shape[:2]
-        copies = image.repeat_interleave(candidates, dim=0)
-        output = network(copies, step.repeat_interleave(candidates), action.flatten(0, 1))
-        return network.value_of(output).view(batch, candidates)
-
-    return q_of_actions
-
-
-def anew(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
-    """Return Q of candidates by a trunk that runs again at every call."""
-    return lambda action: network.at(image, step)(action)
 
 
 def decisions(network: QNetwork, actor: torch.nn.Module, batch: int) -> dict[str, Callable[[], Any]]:

@@ -37,10 +37,10 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def report(title: str, rows: list[dict[str, Any]], facts: dict[str, Any], out: Path | None) -> None:
-    """Print a benchmark's table, and write it as JSON where `out` is given."""
+    """Print a benchmark's table, and write it as JSON where `out` is given; a fact may be rows of a further table."""
     print(f"{title}\n{table(rows)}")
     for name, value in facts.items():
-        print(f"{name}: {_shown(value)}")
+        print(f"\n{name}\n{table(value)}" if isinstance(value, list) else f"{name}: {_shown(value)}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps({"title": title, "rows": rows, **facts}, indent=2) + "\n")

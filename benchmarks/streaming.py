@@ -1,0 +1,132 @@
+"""What streaming from disk costs training, in waiting and in memory: a part of `loading.py`.
+
+"Streaming" is reading through a buffer that holds a tenth of the data, as with data larger than memory.
+"""
+
+import contextlib
+import itertools
+import multiprocessing
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from timing import median_ratio
+
+from graspq.common.errors import UserError
+from graspq.datasets.blocks import row_bytes
+from graspq.datasets.dataset import open_shards
+from graspq.datasets.loader import TransitionLoader
+from graspq.datasets.pool import ShardPool
+from graspq.datasets.sampler import Sampler
+from graspq.train.batch import to_tensors
+from graspq.train.batches import training_batches
+from graspq.train.hardware import keep_freed_memory
+from graspq.train.loop import Session, session
+from graspq.train.settings import preset_settings
+
+TIMES = 10
+CPU = torch.device("cpu")
+
+
+def larger(pool: ShardPool, batch_size: int) -> tuple[ShardPool, int]:
+    """Return the pool with its blocks named so often that a tenth of it is enough as a buffer, and those bytes."""
+    for copies in itertools.count(1):
+        blocks = pool.blocks * copies
+        rows = sum(ref.rows for ref in blocks) // TIMES
+        with contextlib.suppress(UserError):
+            Sampler([ref.rows for ref in blocks], batch_size, 0, rows)
+            return replace(pool, blocks=blocks), rows * row_bytes(pool.image_shape)
+    raise AssertionError
+
+
+def waiting_row(current: Session, pool: ShardPool, steps: int, turns: int) -> dict[str, Any]:
+    """Return what a training step on streamed batches waits for them, and how much slower it is than on ready ones."""
+    waits, totals, readies = [], [], []
+    pool = pool.with_discount(current.discount)
+    with training_batches(pool, current.settings, current.estimator, CPU, 0) as batches:
+        ready = list(itertools.islice(batches, 4))
+        for turn in range(turns + 1):
+            start = time.perf_counter()
+            for batch in itertools.islice(itertools.cycle(ready), steps):
+                current.update(batch).item()
+            seconds = time.perf_counter() - start
+            # Those that were fetched while the ready ones were trained on.
+            for _ in range(3):
+                current.update(next(batches)).item()
+            start, waited = time.perf_counter(), 0.0
+            for _ in range(steps):
+                before = time.perf_counter()
+                batch = next(batches)
+                waited += time.perf_counter() - before
+                current.update(batch).item()
+            if turn > 0:
+                readies.append(seconds)
+                waits.append(waited)
+                totals.append(time.perf_counter() - start)
+    return {
+        "estimator": current.settings.algo,
+        "step, ms": 1e3 * statistics.median(totals) / steps,
+        "waiting, ms": 1e3 * statistics.median(waits) / steps,
+        "share of waiting": median_ratio(waits, totals),
+        "times a step on ready batches": median_ratio(totals, readies),
+    }
+
+
+def waiting_rows(
+    shards: tuple[str, ...], pool: ShardPool, steps: int, turns: int, threads: int | None
+) -> Iterator[dict[str, Any]]:
+    """Yield a row for `mc` and for `dql`."""
+    kept, held_back = pool.split(0.05, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        for algo in ("mc", "dql"):
+            settings = preset_settings(
+                "default", algo=algo, shards=shards, out=Path(folder) / algo, threads=threads, device="cpu"
+            )
+            wide, buffer_bytes = larger(kept, settings.batch_size)
+            settings = replace(settings, buffer_bytes=buffer_bytes)
+            with session(settings, pool, kept, held_back) as current:
+                yield waiting_row(current, wide, steps, turns)
+
+
+def resident_mebibytes() -> float:
+    """Return the memory of this process that is resident, MiB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
+
+
+def _memory_of_a_loader(shards: tuple[str, ...], batch_size: int, batches: int) -> dict[str, Any]:
+    keep_freed_memory()
+    pool, buffer_bytes = larger(open_shards(shards), batch_size)
+    start, seen = resident_mebibytes(), []
+    with TransitionLoader(pool, batch_size, 0, buffer_bytes) as loader:
+        for index in range(batches):
+            to_tensors(next(loader), CPU)
+            if index % max(1, batches // 200) == 0:
+                seen.append(resident_mebibytes())
+        taken = loader.peak_bytes
+    quarter = max(1, len(seen) // 4)
+    early, late = statistics.mean(seen[quarter : 2 * quarter]), statistics.mean(seen[-quarter:])
+    return {
+        "batches": batches,
+        "data over buffer": pool.rows * row_bytes(pool.image_shape) / buffer_bytes,
+        "epochs": batches * batch_size / pool.rows,
+        "buffer, MiB": buffer_bytes / 2**20,
+        "blocks at most, MiB": taken / 2**20,
+        "before, MiB": start,
+        "second quarter, MiB": early,
+        "last quarter, MiB": late,
+        "most, MiB": max(seen),
+        "growth": late / early - 1,
+    }
+
+
+def memory_row(shards: tuple[str, ...], batch_size: int, batches: int) -> dict[str, Any]:
+    """Return the resident memory of a streaming loader in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as process:
+        row: dict[str, Any] = process.apply(_memory_of_a_loader, (shards, batch_size, batches))
+        return row
