@@ -57,8 +57,15 @@ def main(shards: tuple[str, ...], turns: int, steps: int, threads: int | None, o
     runs, real = {}, {}
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         for name in ESTIMATORS:
+            # Without its rest: ddpg's actor is at work in most of a training.
             settings = preset_settings(
-                "default", algo=name, shards=shards, out=Path(folder) / name, threads=threads, device="cpu"
+                "default",
+                algo=name,
+                shards=shards,
+                out=Path(folder) / name,
+                threads=threads,
+                device="cpu",
+                actor_rest=0.0,
             )
             current = stack.enter_context(session(settings, pool, kept, held_back))
             batches = ready(current, kept, steps)

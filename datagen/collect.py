@@ -28,13 +28,16 @@ class CollectingPolicy(Protocol):
     def exploration(self) -> float:
         """Its exploration parameter, for the episodes table."""
 
-    def act(self, image: np.ndarray, step: int, draws: np.random.Generator) -> np.ndarray:
+    def act(
+        self, image: np.ndarray, step: int, draws: np.random.Generator, pose: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return an action, float32 [4] in [-1, 1].
 
         Args:
             image: uint8 [H, W, 3] RGB.
             step: actions taken so far, 0 .. T-1.
             draws: one stream for each episode.
+            pose: of the gripper, float32 [4] = (x, y, z, φ), metres and radians; for searches that end in a workspace.
         """
 
 
@@ -50,7 +53,9 @@ class BlindPolicy:
         """Its probability of moving straight down."""
         return self.random.descend_probability
 
-    def act(self, image: np.ndarray, step: int, draws: np.random.Generator) -> np.ndarray:
+    def act(
+        self, image: np.ndarray, step: int, draws: np.random.Generator, pose: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return a random action, float32 [4]."""
         return self.random.act(draws)
 
@@ -90,7 +95,7 @@ def _collect_episode(
     images, actions, rewards, poses = [], [], [], []
     terminated, info = False, {}
     while not terminated:
-        action = policy.act(observation.image, observation.step, draws)
+        action = policy.act(observation.image, observation.step, draws, observation.gripper_pose)
         outcome = simulation.step(action, observe_end=False)
         images.append(observation.image)
         poses.append(observation.gripper_pose)

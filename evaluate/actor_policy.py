@@ -31,7 +31,11 @@ class ActorPolicy(Policy):
         self.device = device
 
     def decide(
-        self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator | None],
+        poses: np.ndarray | None = None,
     ) -> Decision:
         """Return the actor's action for each state; the generators are not used. See `Policy.decide`."""
         with torch.inference_mode():

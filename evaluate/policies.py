@@ -71,7 +71,11 @@ class Policy(abc.ABC):
 
     @abc.abstractmethod
     def decide(
-        self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator | None],
+        poses: np.ndarray | None = None,
     ) -> Decision:
         """Decide for N states; a state's decision does not depend on the others.
 
@@ -79,18 +83,22 @@ class Policy(abc.ABC):
             images: uint8 [N, H, W, 3] RGB.
             steps: int64 [N], actions taken so far, 0 .. T-1.
             generators: the noise of each state; None marks a row that nobody waits for, its action means nothing.
+            poses: of the gripper, float [N, 4] = (x, y, z, φ), metres and radians. No network sees them; a policy that
+                searches motions to a last pose keeps that inside the workspace by them, where they are given.
         """
 
     def act_batch(self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator]) -> np.ndarray:
         """Return the actions for N states, float32 [N, 4]; see `decide`."""
         return self.decide(images, steps, generators).actions
 
-    def act(self, image: np.ndarray, step: int) -> np.ndarray:
+    def act(self, image: np.ndarray, step: int, pose: np.ndarray | None = None) -> np.ndarray:
         """Return the action for one state, float32 [4]; noise comes from the policy's own generator, see `seed`."""
         if self._own is None:
             self.seed(0)
         assert self._own is not None
-        action: np.ndarray = self.decide(np.asarray(image)[None], np.asarray([step], dtype=np.int64), [self._own])[0][0]
+        poses = None if pose is None else np.asarray(pose)[None]
+        steps = np.asarray([step], dtype=np.int64)
+        action: np.ndarray = self.decide(np.asarray(image)[None], steps, [self._own], poses).actions[0]
         return action
 
     def seed(self, seed: int) -> None:
@@ -111,7 +119,11 @@ class RandomObservationPolicy(Policy):
         self._policy = RandomPolicy()
 
     def decide(
-        self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator | None],
+        poses: np.ndarray | None = None,
     ) -> Decision:
         """Draw an action for each state from its own generator."""
         actions = np.zeros((len(steps), ACTION_DIMENSIONS), dtype=np.float32)
@@ -158,7 +170,11 @@ class UserPolicy(Policy):
         return cls(name, wrapped, Path(source) if source is not None else None)
 
     def decide(
-        self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator | None],
+        poses: np.ndarray | None = None,
     ) -> Decision:
         """Ask the user's object and check what it says.
 

@@ -11,8 +11,9 @@ import torch
 
 from graspq.evaluate.policies import ACTION_DIMENSIONS, Decision, Policy
 from graspq.evaluate.settings import CemSettings
+from graspq.sim.task import TaskSettings
 from graspq.train.selection import SearchSpace, cross_entropy_method, one_step_of
-from graspq.train.supervised import motions_at
+from graspq.train.supervised import cut_to, motions_at
 
 if TYPE_CHECKING:
     from graspq.train.networks import QNetwork
@@ -25,7 +26,11 @@ class QPolicy(Policy):
         self.network, self.cem, self.device = network.to(device).eval(), cem, device
 
     def decide(
-        self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator | None],
+        poses: np.ndarray | None = None,
     ) -> Decision:
         """Search the best action of each state; see `Policy.decide`."""
         noise = torch.from_numpy(self._noise(generators)).to(self.device)
@@ -36,13 +41,13 @@ class QPolicy(Policy):
                 noise,
                 elites=self.cem.elites,
                 answer=self.cem.answer,
-                space=self._space(step),
+                space=self._space(step, None if poses is None else torch.from_numpy(poses).to(self.device)),
             )
             action = self._executed(choice.action.float())
         return Decision(np.clip(action.cpu().numpy(), -1, 1), choice.q.float().cpu().numpy())
 
-    def _space(self, step: torch.Tensor) -> SearchSpace | None:
-        """Return where to search at steps int64 [B]; None for a step's own actions."""
+    def _space(self, step: torch.Tensor, pose: torch.Tensor | None) -> SearchSpace | None:
+        """Return where to search at steps int64 [B] from poses float [B, A]; None for a step's own actions."""
         return None
 
     def _executed(self, found: torch.Tensor) -> torch.Tensor:
@@ -66,17 +71,28 @@ class QPolicy(Policy):
 class SyntheticPolicy(QPolicy):
     """Searches the whole motion to the last pose, as `supervised` learns it, and takes its first step.
 
-    The motion lies in the range of the training data at that step; it is planned anew at every step.
+    The motion lies in the range of the training data at that step, and where the gripper's pose is given it ends inside
+    the workspace. It is planned anew at every step.
     """
 
     def __init__(
-        self, network: "QNetwork", cem: CemSettings, device: torch.device, extra: dict[str, torch.Tensor]
+        self,
+        network: "QNetwork",
+        cem: CemSettings,
+        device: torch.device,
+        extra: dict[str, torch.Tensor],
+        task: TaskSettings,
     ) -> None:
         super().__init__(network, cem, device)
         self.extra = {name: tensor.to(device) for name, tensor in extra.items()}
+        low, high = task.workspace_bounds
+        self.low, self.high, self.limits = (torch.tensor(row, device=device) for row in (low, high, task.action_limits))
 
-    def _space(self, step: torch.Tensor) -> SearchSpace:
-        return motions_at(self.extra, step)
+    def _space(self, step: torch.Tensor, pose: torch.Tensor | None) -> SearchSpace:
+        space = motions_at(self.extra, step)
+        if pose is None:
+            return space
+        return cut_to(space, (self.low - pose) / self.limits, (self.high - pose) / self.limits)
 
     def _executed(self, found: torch.Tensor) -> torch.Tensor:
         return one_step_of(found, self.cem.synthetic_step)

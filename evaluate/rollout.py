@@ -38,6 +38,7 @@ class _Slot:
     rng: np.random.Generator | None = None
     image: np.ndarray | None = None
     step: int = 0
+    pose: np.ndarray = field(default_factory=lambda: np.zeros(4, dtype=np.float32))
     q: float | None = None
     frames: list[np.ndarray] = field(default_factory=list)
 
@@ -126,7 +127,8 @@ class Rollout:
         for row, slot in enumerate(self.slots):
             if slot.image is not None:
                 images[row], steps[row] = slot.image, slot.step
-        decision = self.policy.decide(images, steps, [slot.rng for slot in self.slots])
+        poses = np.stack([slot.pose for slot in self.slots])
+        decision = self.policy.decide(images, steps, [slot.rng for slot in self.slots], poses)
         if decision.q is not None:
             for row, slot in enumerate(self.slots):
                 slot.q = float(decision.q[row])
@@ -169,7 +171,7 @@ class Rollout:
             self._finish(slot, message)
         else:
             if isinstance(message, Seen):
-                slot.image, slot.step = message.image, message.step
+                slot.image, slot.step, slot.pose = message.image, message.step, message.pose
                 slot.frames.append(message.image)
             crew.pending = [command for command in crew.pending if command.slot != message.slot]
 

@@ -87,11 +87,16 @@ def film_episode(
     rngs[row] = generator("evaluate/policy", stage.seed, episode)
     images = np.zeros((environments, *seen.image.shape), dtype=np.uint8)
     steps = np.zeros(environments, dtype=np.int64)
+    poses = np.zeros((environments, 4), dtype=np.float32)
     with _Filming(simulation, size) as filming:
         filming.shoot(PAUSE)
         while True:
             images[row], steps[row] = seen.image, seen.step
-            action = oracle.act(simulation) if policy is None else policy.decide(images, steps, rngs).actions[row]
+            poses[row] = seen.gripper_pose
+            if policy is None:
+                action = oracle.act(simulation)
+            else:
+                action = policy.decide(images, steps, rngs, poses).actions[row]
             outcome = simulation.step(action)
             seen = outcome.observation
             if outcome.terminated:

@@ -68,11 +68,12 @@ class Begun:
 
 @dataclass(frozen=True)
 class Seen:
-    """An episode waits for an action; image uint8 [H, W, 3]."""
+    """An episode waits for an action; image uint8 [H, W, 3], pose of the gripper float32 [4]."""
 
     slot: int
     image: np.ndarray
     step: int
+    pose: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,7 @@ class _Worker:
         outcome = simulation.step(self._action(simulation, command))
         seen = outcome.observation
         if not outcome.terminated:
-            self.connection.send(Seen(command.slot, seen.image, seen.step))
+            self.connection.send(Seen(command.slot, seen.image, seen.step, seen.gripper_pose))
             return
         self.connection.send(Ended(command.slot, seen.image, simulation.step_count, outcome.reward, outcome.info))
         if command.following is None:
@@ -153,7 +154,7 @@ class _Worker:
         simulation = self.simulations[slot]
         seen = begin_episode(simulation, self.objects, self.stage.split, self.stage.seed, episode)
         self.connection.send(Begun(slot, episode, simulation.object_ids))
-        self.connection.send(Seen(slot, seen.image, seen.step))
+        self.connection.send(Seen(slot, seen.image, seen.step, seen.gripper_pose))
 
     def _action(self, simulation: "GraspSimulation", command: Command) -> np.ndarray:
         if command.action is not None:

@@ -35,17 +35,22 @@ class ExploringPolicy:
     random: RandomPolicy
     greedy: Policy
 
-    def act(self, image: np.ndarray, step: int, draws: np.random.Generator) -> np.ndarray:
+    def act(
+        self, image: np.ndarray, step: int, draws: np.random.Generator, pose: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return an action, float32 [4] in [-1, 1].
 
         Args:
             image: uint8 [H, W, 3] RGB.
             step: actions taken so far, random ones too.
             draws: of the coin, the random action and the policy's search.
+            pose: of the gripper, float32 [4], metres and radians; see `Policy.decide`.
         """
         if draws.random() < self.exploration:
             return self.random.act(draws)
-        action: np.ndarray = self.greedy.decide(image[None], np.asarray([step], dtype=np.int64), [draws]).actions[0]
+        poses = None if pose is None else pose[None]
+        steps = np.asarray([step], dtype=np.int64)
+        action: np.ndarray = self.greedy.decide(image[None], steps, [draws], poses).actions[0]
         return action
 
 

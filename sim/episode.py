@@ -138,11 +138,8 @@ class GraspSimulation:
         return Outcome(last, float(rewarded is not None), True, info)
 
     def _commanded_after(self, action: np.ndarray) -> np.ndarray:
-        task = self.task
-        pose = self.arm.commanded + np.clip(action, -1.0, 1.0) * np.asarray(task.action_limits)
-        low = (task.bin_center_x - task.workspace, -task.workspace, task.grasp_height, -task.phi_limit)
-        high = (task.bin_center_x + task.workspace, task.workspace, task.home_height, task.phi_limit)
-        clipped: np.ndarray = np.clip(pose, low, high)
+        pose = self.arm.commanded + np.clip(action, -1.0, 1.0) * np.asarray(self.task.action_limits)
+        clipped: np.ndarray = np.clip(pose, *self.task.workspace_bounds)
         return clipped
 
     def _close_and_lift(self, *, descend: bool) -> list[str]:

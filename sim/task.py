@@ -86,6 +86,13 @@ class TaskSettings(Settings):
         """Displacement of an action of ones: metres, metres, metres, radians."""
         return (self.translation_limit,) * 3 + (self.rotation_limit,)
 
+    @property
+    def workspace_bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Least and greatest pose (x, y, z, phi) that the gripper is commanded to: metres, metres, metres, radians."""
+        low = (self.bin_center_x - self.workspace, -self.workspace, self.grasp_height, -self.phi_limit)
+        high = (self.bin_center_x + self.workspace, self.workspace, self.home_height, self.phi_limit)
+        return low, high
+
 
 TASKS = {
     "regular": TaskSettings(),

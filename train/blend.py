@@ -5,9 +5,9 @@ Dimensions: B batch, T steps, A action, N candidates, n later steps (real ones a
 K cells (steps times bins of Q).
 
 What is optimised. At each later step two values may stand for the state: the lagged network's V, or the corrected
-rest of the episode, y - A (see `blended`). The first is off by what Q still lacks there, b; the second by chance:
-what remains of an outcome's variance v among the n_c training steps of the same cell c, v / n_c, for regression
-averages over those. The weight λ of the second makes the expected squared error the least:
+rest of the episode, y - A (see `blended`; V and A as in `corrected`, centred). The first is off by what Q still lacks
+there, b; the second by chance: what remains of an outcome's variance v among the n_c training steps of the same cell c,
+v / n_c, for regression averages over those. The weight λ of the second makes the expected squared error the least:
 
     λ_c = argmin (1 - λ)² b² + λ² v / n_c = b² / (b² + v / n_c)
 
@@ -19,8 +19,8 @@ variance v. The mean of m seen errors overstates b² by chance, by v / m, and by
 So λ is 1 where Q is wrong beyond doubt, as in the first steps of training; it falls to 0 where Q agrees with the
 outcomes up to chance, and the fewer the data are, the larger is what passes for chance. Q* is the fixed point for every
 λ that depends on the state and action alone, as it is of both parents: E[e_t | s_t, a_t] = 0 there. Measured on the
-tiny decision process of the tests, distance to Q* (dql, corr-mc, blend), 400 steps of training: 0.149, 0.181, 0.147
-with 200 episodes; 0.054, 0.071, 0.063 with 20,000; 0.149, 0.135, 0.135 with 20,000 and 120 steps.
+tiny decision process of the tests, distance to Q* (dql, corr-mc, blend), 400 steps of training: 0.149, 0.154, 0.132
+with 200 episodes; 0.054, 0.086, 0.068 with 20,000; 0.149, 0.138, 0.138 with 20,000 and 120 steps.
 
 Limits: errors are measured on the data that are trained on, not on held-back ones: where the network has learned single
 outcomes by heart, e is 0 and both targets are the same. Squared errors of a cell stand for all of its states.

@@ -20,7 +20,7 @@ Why 1, 3 and 5: where waiting costs no more than the discount, a V that is too h
 γ δ / (1 - γ), nine times as much, in Q of waiting; and the policy waits until T. Measured with `mc`'s recipe on 10,000
 grasps, 3,000 steps; w is the mean Q of going up at the steps from 3 on, where the best way down has Q 0.77:
 
-    θ' picks and judges, not centred, ν over half of the training        success 0.002 of 500   w 0.92
+    θ' picks and judges, not centred, ν over half of the training        success 0.002 of 500   w 0.90
     the same, ν over a twentieth    (targets above 1 on average; loss 262 at step 1,800)  0.06 of 100
     the same, 1,500 steps, θ picks; on the mirror image                  0 of 200; 0 of 200
     θ' picks and judges, centred, ν over half                            0 of 100               w 0.74

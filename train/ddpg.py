@@ -15,7 +15,9 @@ Differs, for `ddpg` (what all rows share stands in `estimators`):
 6. Its learning rate is then a tenth of Q's (`--actor-rate`), as in Lillicrap et al. 2015; the released code has one
    rate for both, and so has `--preset paper`. Adam's steps do not shrink with the slope of Q, which is small (0.005 in
    such short runs): at Q's rate the actor was in a corner of the box within 30 steps, wherever Q sloped.
-7. It is otherwise trained with Q's settings, and acts by the average of its weights where Q does (`--average-decay`).
+7. It takes a step after every second step of Q (`--actor-every`; 1 with `--preset paper`), as in Fujimoto et al. 2018:
+   a step of both costs 1.8 times one of Q alone.
+8. It is otherwise trained with Q's settings, and acts by the average of its weights where Q does (`--average-decay`).
 """
 
 from typing import TYPE_CHECKING
@@ -51,12 +53,13 @@ def actor_critic(state: "TrainState", batch: Batch, estimator: "Estimator", cont
 
         φ ← φ + optimiser(mean g(s) · ∂π_φ(s) / ∂φ),  g = `uphill` of Q_θ at π_φ(s)
 
-    The critic judges in evaluation mode, and its weights stay as they are. See 5. of the module for the actor's rest.
+    The critic judges in evaluation mode, and its weights stay as they are. See 5. and 7. of the module for when there
+    is no step of the actor.
 
-    Source: Quillen et al. 2018, section "Deep Deterministic Policy Gradient"; the actor's step follows each step of Q.
+    Source: Quillen et al. 2018, section "Deep Deterministic Policy Gradient"; its actor takes a step at each.
     """
     loss = regression(state, batch, estimator, context)
-    if context.progress < context.actor_rest:
+    if context.progress < context.actor_rest or state.step % context.actor_every != 0:
         return loss
     actor = state.learned["actor"].train()
     image, step = batch.real(batch.image), batch.real(batch.step)

@@ -233,6 +233,7 @@ class Session:
             mirror=self.settings.mirror,
             actor_rest=self.settings.actor_rest,
             actor_rate=self.settings.actor_rate,
+            actor_every=self.settings.actor_every,
             path_steps=self.settings.path_steps,
             penalty=self.settings.penalty,
             kl_bound=self.settings.kl_bound,

@@ -36,6 +36,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "centred": True,
         "actor_rest": 0.2,
         "actor_rate": 0.1,
+        "actor_every": 2,
         "path_steps": None,
         "penalty": None,
         "precision": "auto",
@@ -59,6 +60,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "centred": False,
         "actor_rest": 0.0,
         "actor_rate": 1.0,
+        "actor_every": 1,
         "path_steps": 10,
         "penalty": 3.0,
         "precision": "float32",
@@ -137,6 +139,9 @@ class TrainSettings(Settings):
     )
     actor_rate: float = _preset_setting(
         "actor_rate", help="Learning rate of the actor of ddpg and pcl over that of Q or V.", minimum=0, maximum=10
+    )
+    actor_every: int = _preset_setting(
+        "actor_every", help="Steps of ddpg's Q from one step of its actor to the next.", minimum=1
     )
     path_steps: int | None = _preset_setting(
         "path_steps", help="Steps d of a path of pcl; the rest of the episode where it is not given.", minimum=1

@@ -101,6 +101,7 @@ class Context:
         penalty: λ of path consistency; None lets the estimator tune it to `kl_bound`.
         kl_bound: what the mean relative entropy to the lagged policy is tuned to, nats.
         actor_rest: part of the training in which an actor that follows Q stays as it began.
+        actor_every: steps of Q from one step of an actor that follows it to the next.
         actor_rate: learning rate of an actor over that of Q or V.
         watched: mean absolute values of what the task keeps near [0, 1], by name, left here by updates: the loop stops
             the run where one is out of all reason.
@@ -124,6 +125,7 @@ class Context:
     kl_bound: float = 0.02
     actor_rest: float = 0.0
     actor_rate: float = 1.0
+    actor_every: int = 1
     watched: dict[str, Tensor] = dataclasses.field(default_factory=dict)
     part: BatchPart = WHOLE
 

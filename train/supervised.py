@@ -10,8 +10,8 @@ Differs:
 2. p_T - p_t is of measured poses, as the text has it; the released code adds up the commanded actions.
 3. The search starts from mean and deviation of the motions at that step in the data, and stays in their range, not from
    (0, 0, -1, 0) as for single steps.
-4. The range is not cut to end poses inside the workspace for each state: the pose is no part of the state. At step 0,
-   where it is always the same, the range holds end poses of the data alone; later the arm itself stops at the border.
+4. The range is cut to end poses inside the workspace by the gripper's pose, which the simulator or robot tells the
+   policy. It is no part of the state, and no network sees it.
 5. At steps that are rare in the data the range is as narrow as those few motions, and at a step that no training
    episode reached it is that of the last step that one did.
 """
@@ -64,3 +64,18 @@ def motions_at(extra: dict[str, Tensor], step: Tensor) -> SearchSpace:
     """
     tables = [extra[PREFIX + name] for name in SearchSpace._fields]
     return SearchSpace(*(table[step.clamp(0, len(table) - 1)] for table in tables))
+
+
+def cut_to(space: SearchSpace, low: Tensor, high: Tensor) -> SearchSpace:
+    """Return the space less what is out of reach; where nothing of it is within reach, the nearest that is.
+
+    Args:
+        space: see `motions_at`.
+        low: least motion that is possible, float [B, A].
+        high: greatest, at least `low`.
+    """
+
+    def reachable(bound: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(bound, low.to(bound)), high.to(bound))
+
+    return space._replace(low=reachable(space.low), high=reachable(space.high))

@@ -79,7 +79,7 @@ def test_another_policy_sees_image_and_step_and_is_named_and_scenes_stay_the_sam
         def __init__(self):
             self.seen = []
 
-        def act(self, image, step, draws):
+        def act(self, image, step, draws, pose=None):
             self.seen.append((image, step))
             return np.array([0, 0, -1 if step > 1 else 0, 0], np.float32)
 

@@ -10,6 +10,7 @@ from graspq.common.seeding import generator
 from graspq.evaluate.policies import Policy
 from graspq.evaluate.q_policy import QPolicy, SyntheticPolicy
 from graspq.evaluate.settings import CemSettings
+from graspq.sim.task import TASKS
 from graspq.train.networks import QNetwork
 from graspq.train.selection import StepMode
 
@@ -41,7 +42,7 @@ class Far(QNetwork):
 
 def decided(network: Far, mode: StepMode, steps: list[int]) -> tuple[np.ndarray, np.ndarray | None]:
     cem = CemSettings(iterations=6, samples=256, elites=16, synthetic_step=mode)
-    policy = SyntheticPolicy(network, cem, torch.device("cpu"), EXTRA)
+    policy = SyntheticPolicy(network, cem, torch.device("cpu"), EXTRA, TASKS["regular"])
     images = np.zeros((len(steps), 8, 8, 3), dtype=np.uint8)
     return policy.decide(images, np.asarray(steps), [generator("test", row) for row in range(len(steps))])
 
@@ -79,3 +80,20 @@ def test_a_run_of_supervised_acts_by_synthetic_search_and_one_of_mc_by_search(da
     action = policy.act(np.zeros((64, 64, 3), dtype=np.uint8), 0)
     assert action.shape == (4,) and np.abs(action).max() <= 1
     assert policy.identity() == {"cem": CemSettings().to_json()}
+
+
+def test_a_motion_ends_inside_the_workspace_where_the_pose_is_known() -> None:
+    network, task = Far(), TASKS["regular"]
+    low, high = (np.asarray(bound) for bound in task.workspace_bounds)
+    # From the border where BEST leads out of the workspace in y, 3 limits below the least height that it may end at.
+    pose = np.array([[0.55, -0.13 + 0.06, 0.015 + 3 * 0.06, 0.0]], dtype=np.float32)
+    policy = SyntheticPolicy(network, CemSettings(), torch.device("cpu"), EXTRA, task)
+    images, steps = np.zeros((1, 8, 8, 3), dtype=np.uint8), np.zeros(1, dtype=np.int64)
+    policy.decide(images, steps, [generator("test", 0)], pose)
+    asked = torch.cat([action[0] for action in network.asked]).numpy()
+    ends = pose + asked * np.asarray(task.action_limits)
+    assert (ends >= low - 1e-6).all() and (ends <= high + 1e-6).all()
+    assert asked[:, 1].min() == pytest.approx(-1) and asked[:, 2].min() == pytest.approx(-3)
+    network.asked.clear()
+    policy.decide(images, steps, [generator("test", 0)])
+    assert float(torch.cat([action[0] for action in network.asked])[:, 1].min()) < -2, "without a pose it is not cut"

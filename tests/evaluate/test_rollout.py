@@ -98,12 +98,12 @@ class KillsOnce(RandomObservationPolicy):
         self.times = times
         self.rollout: Rollout | None = None
 
-    def decide(self, images, steps, generators):  # type: ignore[no-untyped-def]
+    def decide(self, images, steps, generators, poses=None):  # type: ignore[no-untyped-def]
         assert self.rollout is not None
         if self.times > 0:
             self.times -= 1
             os.kill(self.rollout._crews[0].process.pid, signal.SIGKILL)
-        return super().decide(images, steps, generators)
+        return super().decide(images, steps, generators, poses)
 
 
 def test_episodes_of_a_worker_that_died_are_run_again_with_the_same_result(

@@ -18,7 +18,11 @@ class StepTeller(Policy):
     """Its dx tells the step that it was shown."""
 
     def decide(
-        self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator | None]
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator | None],
+        poses: np.ndarray | None = None,
     ) -> Decision:
         assert images.shape == (1, 64, 64, 3) and len(generators) == 1
         return Decision(np.array([[steps[0] / 20, 0, 0, 0]], np.float32), None)

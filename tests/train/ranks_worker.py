@@ -50,6 +50,7 @@ def train_until(step: int, out: Path, shards: str, name: str, ranks: Ranks) -> N
         learning_rate=1e-3,
         warmup=0.0,
         lag_steps=2,
+        actor_rest=0.0,
         precision="float32",
         device="cpu",
         threads=1,

@@ -3,6 +3,7 @@
 That actor and critic reach the best policy of a known decision process stands in `test_learning`.
 """
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -119,6 +120,25 @@ def test_the_actor_rests_for_its_part_of_the_steps_and_then_moves(
     actors = [load_acting(run, step).networks["actor"].state_dict() for step in (1, 2, 3)]
     same = [all(torch.equal(actors[0][name], other[name]) for name in other) for other in actors[1:]]
     assert same == [True, False]
+
+
+def test_the_actor_takes_a_step_after_as_many_steps_of_q_as_it_is_told(
+    settings: Callable[..., TrainSettings], tmp_path: Path
+) -> None:
+    short = {"preset": "paper", "steps": 5, "checkpoint_every": 1, "keep_checkpoints": 5}
+    run = train(settings("ddpg", out=tmp_path / "run", actor_rest=0.0, actor_every=2, **short)).folder
+    states = [load_acting(run, step).networks for step in (1, 2, 3, 4)]
+    changed = {
+        part: [
+            any(
+                not torch.equal(before[part].state_dict()[name], value)
+                for name, value in after[part].state_dict().items()
+            )
+            for before, after in itertools.pairwise(states)
+        ]
+        for part in ("actor", "q")
+    }
+    assert changed == {"actor": [False, True, False], "q": [True, True, True]}
 
 
 @pytest.mark.parametrize(("top", "reached"), [(0.4, 0.4), (3.0, 1.0)])
