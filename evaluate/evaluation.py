@@ -124,13 +124,19 @@ def _scenes(job: Job, facts: "RunFacts | None", beside: Sequence[Prepared]) -> "
     """Return the task and the object set that a job's scenes are made of."""
     from graspq.sim.task import TaskSettings, task_settings
 
-    name = job.task or (str(facts.task["name"]) if facts is not None else "regular")
+    name = job.task or (str(facts.task["name"]) if facts is not None else _common_task(beside))
     if facts is not None and facts.task["name"] == name:
         objects = find_object_set(name, job.objects, facts.object_set, facts.datasets)
         return TaskSettings.from_json(facts.task), objects
     same = [other for other in beside if other.facts is not None and other.task.name == name]
     task = same[0].task if same and facts is None else task_settings(name)
     return task, find_object_set(name, job.objects, None, (), [other.objects.folder for other in same])
+
+
+def _common_task(beside: Sequence[Prepared]) -> str:
+    """Return the task that the runs of a plan have in common; `regular` where there are none or several."""
+    names = {other.task.name for other in beside if other.facts is not None}
+    return names.pop() if len(names) == 1 else "regular"
 
 
 def _check_fit(job: Job, facts: "RunFacts | None", task: "TaskSettings") -> None:

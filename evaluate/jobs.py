@@ -27,7 +27,7 @@ class Job:
     Attributes:
         run: folder of the training run; None for a policy without one.
         policy: `random`, `oracle` or `module:factory`; None for a run.
-        task: name of the task; None for the run's own (`regular` without a run).
+        task: name of the task; None for the run's own; without a run that of the plan's runs, else `regular`.
         split: split of the object set.
         seed: seed of the scenes.
         episodes: number of episodes.

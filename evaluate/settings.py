@@ -49,7 +49,10 @@ class EvalSettings(Settings):
     policy: tuple[str, ...] = setting(
         (), help="Score also this policy: random, oracle or your own as module:factory. May be repeated."
     )
-    task: str | None = setting(None, help="Task: regular or targeted. Default: the run's own, else regular.")
+    task: str | None = setting(
+        None,
+        help="Task: regular or targeted. Default: the run's own; without a run that of the runs beside, else regular.",
+    )
     split: str = setting("test", help="Split of the object set; test-clutter for unseen distractors (targeted).")
     episodes: int = setting(1000, help="Episodes (grasps) of each job, such as 200 or 1k.", parse=parse_count)
     seed: int = setting(0, help="Seed of the scenes: the same seed gives every policy the same scenes.", minimum=0)

@@ -17,6 +17,8 @@ from graspq.common.files import sha256_of
 from graspq.evaluate.films import read_films
 from graspq.evaluate.records import Evaluation
 from graspq.evaluate.statistics import wilson_interval
+from graspq.objects.object_set import ObjectSet
+from graspq.sim.task import TASKS
 
 SMALL = ("--episodes", "2", "--environments", "2", "--workers", "1")
 
@@ -91,6 +93,27 @@ def test_policies_without_a_run_meet_the_scenes_of_the_run_beside_them(
     assert run.prepared.task.finger_force == 17.0
     assert run.prepared.task == random.prepared.task == oracle.prepared.task
     assert random.status == "to do"
+
+
+def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_have_in_common(
+    workplace: SimpleNamespace, run_folder: Path, targeted_objects: ObjectSet, tmp_path: Path
+) -> None:
+    from graspq.evaluate.batch import make_plan
+    from graspq.evaluate.jobs import jobs_from_settings
+
+    targeted = tmp_path / "targeted"
+    shutil.copytree(run_folder, targeted)
+    config = json.loads((targeted / "config.json").read_text())
+    config["dataset"]["task"] = TASKS["targeted"].to_json()
+    (targeted / "config.json").write_text(json.dumps(config))
+
+    def tasks(*runs: Path, objects: Path | None = None) -> list[str]:
+        settings = replace(workplace.settings, runs=tuple(map(str, runs)), policy=("oracle",), objects=objects)
+        entries = make_plan(jobs_from_settings(settings), settings)
+        return [entry.prepared.task.name if entry.prepared is not None else str(entry.error) for entry in entries]
+
+    assert tasks(targeted, objects=targeted_objects.folder) == ["targeted", "targeted"]
+    assert tasks(run_folder) == ["regular", "regular"]
 
 
 def test_finished_jobs_are_not_run_again_and_nothing_changes(
