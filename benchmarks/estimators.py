@@ -7,41 +7,19 @@ targets, forward, backward and optimiser, as `grasp-train` runs them with defaul
 """
 
 import contextlib
-import itertools
 import statistics
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import click
+from sessions import default_settings, ready, steps_on
 from timing import median_ratio, report, take_turns
 
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.pool import ShardPool
-from graspq.train.batch import Batch
-from graspq.train.batches import training_batches
 from graspq.train.estimators import ESTIMATORS
-from graspq.train.loop import Session, session
-from graspq.train.settings import preset_settings
+from graspq.train.loop import session
 
 RIVAL = "mc"
-
-
-def ready(current: Session, pool: ShardPool, count: int) -> list[Batch]:
-    """Return the first batches of a run."""
-    with training_batches(pool, current.settings, current.estimator, current.precision.device, 0) as batches:
-        return list(itertools.islice(batches, count))
-
-
-def training(current: Session, batches: list[Batch]) -> Callable[[], None]:
-    """Return what trains one step on each batch and waits until it is done."""
-
-    def run() -> None:
-        for batch in batches:
-            loss = current.update(batch)
-        loss.item()
-
-    return run
 
 
 @click.command()
@@ -57,19 +35,10 @@ def main(shards: tuple[str, ...], turns: int, steps: int, threads: int | None, o
     runs, real = {}, {}
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         for name in ESTIMATORS:
-            # Without its rest: ddpg's actor is at work in most of a training.
-            settings = preset_settings(
-                "default",
-                algo=name,
-                shards=shards,
-                out=Path(folder) / name,
-                threads=threads,
-                device="cpu",
-                actor_rest=0.0,
-            )
+            settings = default_settings(name, shards, Path(folder) / name, threads)
             current = stack.enter_context(session(settings, pool, kept, held_back))
             batches = ready(current, kept, steps)
-            runs[name], real[name] = training(current, batches), sum(int(batch.real_steps) for batch in batches)
+            runs[name], real[name] = steps_on(batches, current.update), sum(int(batch.real_steps) for batch in batches)
         seconds = take_turns(runs, turns)
     pace = {name: [value / real[name] for value in values] for name, values in seconds.items()}
     rows = [

@@ -24,10 +24,10 @@ from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
 from graspq.common.options import Command
 from graspq.common.seeding import generator
-from graspq.evaluate.evaluation import Prepared, prepare, stage_of
+from graspq.evaluate.evaluation import Prepared, play, prepare, stage_of
 from graspq.evaluate.jobs import jobs_from_settings
 from graspq.evaluate.q_policy import QPolicy
-from graspq.evaluate.rollout import POLICY_PURPOSE, run_episodes
+from graspq.evaluate.rollout import POLICY_PURPOSE
 from graspq.evaluate.settings import EvalSettings
 from graspq.evaluate.workers import Stage, begin_episode
 
@@ -56,7 +56,7 @@ def _succeeds(simulation: Any, stage: Stage, policy: QPolicy, episode: int) -> b
     seen = begin_episode(simulation, simulation.objects, stage.split, stage.seed, episode)
     draws, terminated, info = generator(POLICY_PURPOSE, stage.seed, episode), False, {}
     while not terminated:
-        outcome = simulation.step(policy.act_batch(seen.image[None], [seen.step], [draws])[0])
+        outcome = simulation.step(policy.act_batch(seen.image[None], [seen.step], [draws], seen.gripper_pose[None])[0])
         seen, terminated, info = outcome.observation, outcome.terminated, outcome.info
     return bool(info["success"])
 
@@ -76,15 +76,7 @@ def lockstep(prepared: Prepared, settings: EvalSettings, into: list[Successes]) 
     """Return what runs all episodes as `grasp-eval` does and keeps their successes."""
 
     def run() -> None:
-        job = prepared.job
-        rows, _ = run_episodes(
-            stage_of(prepared),
-            prepared.policy,
-            episodes=job.episodes,
-            environments=job.environments,
-            workers=settings.workers,
-            films=settings.films,
-        )
+        rows, _ = play(prepared, settings)
         into.append({row.episode: row.success for row in rows})
 
     return run

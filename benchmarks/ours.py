@@ -1,15 +1,17 @@
 """Our collection as parts of a benchmark: blocks and shards by the code that `grasp-datagen` runs."""
 
+import contextlib
 import dataclasses
+import itertools
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from memory import resident_bytes
 from phases import Stopwatch
 from tallies import Tally
 
-from graspq.common.errors import UserError
 from graspq.datagen.collect import collect_block
 from graspq.datagen.run import describe
 from graspq.datagen.settings import CollectionSettings, DatagenSettings
@@ -22,7 +24,6 @@ from graspq.sim.bullet import bullet
 from graspq.sim.task import task_settings
 
 TASK = task_settings("regular")
-_MEMORY_FILE = Path("/proc/self/status")
 
 
 class Shards:
@@ -48,22 +49,31 @@ def tally(episodes: Sequence[Episode], core_seconds: float) -> Tally:
     return Tally(core_seconds, len(episodes), actions, actions, sum(bool(one.success) for one in episodes))
 
 
-def collecting(objects: Path, seed: int, blocks: int) -> Iterator[Tally | None]:
-    """A player's part: `blocks` whole blocks at a time, and the shard that they make."""
+@contextlib.contextmanager
+def collection(objects: Path, seed: int, blocks: int) -> Iterator[Callable[[], list[Episode]]]:
+    """Give what collects `blocks` whole blocks at each call, always the next ones, and writes their shard."""
     settings = CollectionSettings(seed=seed)
     with tempfile.TemporaryDirectory() as folder, episode.GraspSimulation(TASK, ObjectSet.load(objects)) as simulation:
-        shards, first = Shards(folder, objects, settings), 0
+        shards, starts = Shards(folder, objects, settings), itertools.count(0, blocks)
+
+        def collect() -> list[Episode]:
+            first = next(starts)
+            made = [collect_block(simulation, settings, first + more, settings.block_size) for more in range(blocks)]
+            done = list(itertools.chain.from_iterable(made))
+            shards.add(done)
+            return done
+
+        yield collect
+
+
+def collecting(objects: Path, seed: int, blocks: int) -> Iterator[Tally | None]:
+    """A player's part: `blocks` whole blocks at a time, and the shard that they make."""
+    with collection(objects, seed, blocks) as collect:
         yield None
         while True:
             start = time.process_time()
-            done = _collect(simulation, settings, range(first, first + blocks))
-            shards.add(done)
-            first += blocks
+            done = collect()
             yield tally(done, time.process_time() - start)
-
-
-def _collect(simulation: episode.GraspSimulation, settings: CollectionSettings, blocks: range) -> list[Episode]:
-    return [one for block in blocks for one in collect_block(simulation, settings, block, settings.block_size)]
 
 
 def watch_collection(watch: Stopwatch) -> None:
@@ -103,20 +113,16 @@ class Profile:
 
 def profiled(objects: Path, seed: int, blocks: int) -> Iterator[Profile | None]:
     """A player's part: as `collecting`, and tells where the time went."""
-    settings = CollectionSettings(seed=seed)
-    with tempfile.TemporaryDirectory() as folder, episode.GraspSimulation(TASK, ObjectSet.load(objects)) as simulation:
-        shards, first = Shards(folder, objects, settings), 0
+    with collection(objects, seed, blocks) as collect:
         yield None
         while True:
             watch = Stopwatch("policy and bookkeeping")
             watch_collection(watch)
             try:
                 with watch:
-                    done = _collect(simulation, settings, range(first, first + blocks))
-                    shards.add(done)
+                    done = collect()
             finally:
                 watch.unwrap()
-            first += blocks
             yield Profile(len(done), dict(watch.seconds), dict(watch.core_seconds), dict(watch.calls))
 
 
@@ -135,15 +141,3 @@ def filling_bins(objects: Path, seed: int, scenes: int) -> Iterator[tuple[int, i
                 collect_block(simulation, settings, block, 1)
             done += scenes
             yield done, resident_bytes()
-
-
-def resident_bytes() -> int:
-    """Return the resident memory of this process.
-
-    Raises:
-        UserError: the system has no /proc.
-    """
-    if not _MEMORY_FILE.is_file():
-        raise UserError(f"--part memory: {_MEMORY_FILE} is not there, memory is measured on Linux alone")
-    line = next(line for line in _MEMORY_FILE.read_text().splitlines() if line.startswith("VmRSS:"))
-    return int(line.split()[1]) * 1024

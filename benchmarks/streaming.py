@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from memory import resident_bytes
+from sessions import default_settings
 from timing import median_ratio
 
 from graspq.common.errors import UserError
@@ -27,7 +29,6 @@ from graspq.train.batch import to_tensors
 from graspq.train.batches import training_batches
 from graspq.train.hardware import keep_freed_memory
 from graspq.train.loop import Session, session
-from graspq.train.settings import preset_settings
 
 TIMES = 10
 CPU = torch.device("cpu")
@@ -84,30 +85,22 @@ def waiting_rows(
     kept, held_back = pool.split(0.05, 0)
     with tempfile.TemporaryDirectory() as folder:
         for algo in ("mc", "dql"):
-            settings = preset_settings(
-                "default", algo=algo, shards=shards, out=Path(folder) / algo, threads=threads, device="cpu"
-            )
+            settings = default_settings(algo, shards, Path(folder) / algo, threads)
             wide, buffer_bytes = larger(kept, settings.batch_size)
             settings = replace(settings, buffer_bytes=buffer_bytes)
             with session(settings, pool, kept, held_back) as current:
                 yield waiting_row(current, wide, steps, turns)
 
 
-def resident_mebibytes() -> float:
-    """Return the memory of this process that is resident, MiB."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
-
-
 def _memory_of_a_loader(shards: tuple[str, ...], batch_size: int, batches: int) -> dict[str, Any]:
     keep_freed_memory()
     pool, buffer_bytes = larger(open_shards(shards), batch_size)
-    start, seen = resident_mebibytes(), []
+    start, seen = resident_bytes() / 2**20, []
     with TransitionLoader(pool, batch_size, 0, buffer_bytes) as loader:
         for index in range(batches):
             to_tensors(next(loader), CPU)
             if index % max(1, batches // 200) == 0:
-                seen.append(resident_mebibytes())
+                seen.append(resident_bytes() / 2**20)
         taken = loader.peak_bytes
     quarter = max(1, len(seen) // 4)
     early, late = statistics.mean(seen[quarter : 2 * quarter]), statistics.mean(seen[-quarter:])

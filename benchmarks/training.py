@@ -15,7 +15,6 @@ and settings, without augmentation: another and smaller job than ours. Where it 
 import contextlib
 import copy
 import dataclasses
-import itertools
 import random
 import statistics
 import tempfile
@@ -28,19 +27,17 @@ import click
 import torch
 from d3rlpy_rival import by_d3rlpy
 from plain_pytorch import PlainTraining, augmented, plain_copy
+from sessions import default_settings, ready, steps_on
 from timing import median_ratio, report, take_turns
 from torch import Tensor
 
 from graspq.common.options import Command
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.pool import ShardPool
 from graspq.train.augment import Augmentation
 from graspq.train.batch import Batch
-from graspq.train.batches import training_batches
 from graspq.train.distributed import WHOLE
 from graspq.train.loop import Session, session
 from graspq.train.selection import uniform_actions
-from graspq.train.settings import preset_settings
 from graspq.train.state import advance, seeded
 from graspq.train.updates import loss_of, target_of
 
@@ -48,13 +45,6 @@ ALGOS = ("mc", "dql", "ddpg")
 TOLERANCE = 1e-4
 PIECES = ("augmentation", "target", "forward", "backward", "optimiser", "averages")
 NETWORK = ("target", "forward", "backward")
-
-
-def ready(current: Session, pool: ShardPool, count: int) -> list[Batch]:
-    """Return the first batches of a run."""
-    pool = pool.with_discount(current.discount)
-    with training_batches(pool, current.settings, current.estimator, current.precision.device, 0) as batches:
-        return list(itertools.islice(batches, count))
 
 
 def plain_batch(batch: Batch) -> dict[str, Tensor]:
@@ -117,28 +107,6 @@ def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> Non
         raise click.ClickException(f"plain {algo}: Q differs by {difference:.2g}, expected at most {TOLERANCE}")
 
 
-def ours(current: Session, batches: list[Batch]) -> Callable[[], None]:
-    """Return what trains one step on each batch and waits until it is done."""
-
-    def run() -> None:
-        for batch in batches:
-            loss = current.update(batch)
-        loss.item()
-
-    return run
-
-
-def plainly(training: PlainTraining, batches: list[dict[str, Tensor]]) -> Callable[[], None]:
-    """Return what trains one plain step on each batch."""
-
-    def run() -> None:
-        for batch in batches:
-            loss = training.update(batch)
-        loss.item()
-
-    return run
-
-
 @dataclasses.dataclass
 class Pieces:
     """Seconds of the pieces of steps, of one estimator, and of whole steps of `Session.update`."""
@@ -191,7 +159,7 @@ def measure_pieces(current: Session, batches: list[Batch], turns: int) -> Pieces
 def rivals_of(current: Session, batches: list[Batch]) -> dict[str, tuple[Callable[[], None], int]]:
     """Return ours and its rival for one estimator: what runs, and how many transitions it trains on."""
     algo, size = current.settings.algo, len(batches[0].action)
-    found = {f"{algo}, graspq": (ours(current, batches), size * len(batches))}
+    found = {f"{algo}, graspq": (steps_on(batches, current.update), size * len(batches))}
     if algo == "ddpg":
         run = by_d3rlpy([plain_batch(batch) for batch in batches], current.settings)
         return found | ({} if run is None else {"ddpg, d3rlpy": (run, size * len(batches))})
@@ -199,7 +167,7 @@ def rivals_of(current: Session, batches: list[Batch]) -> dict[str, tuple[Callabl
     check_agreement(current, plain, batches[0])
     # Sixteen copies of every picture take seconds.
     theirs = [plain_batch(batch) for batch in (batches[:1] if plain.bootstrapped else batches)]
-    return found | {f"{algo}, plain PyTorch": (plainly(plain, theirs), size * len(theirs))}
+    return found | {f"{algo}, plain PyTorch": (steps_on(theirs, plain.update), size * len(theirs))}
 
 
 def speed_rows(runs: dict[str, tuple[Callable[[], None], int]], turns: int) -> list[dict[str, Any]]:
@@ -244,9 +212,7 @@ def main(
     torch.manual_seed(0)
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         for name in dict.fromkeys(algos):
-            settings = preset_settings(
-                "default", algo=name, shards=shards, out=Path(folder) / name, threads=threads, device="cpu"
-            )
+            settings = default_settings(name, shards, Path(folder) / name, threads)
             current = stack.enter_context(session(settings, pool, kept, held_back))
             sessions[name] = current, ready(current, kept, steps)
             runs |= rivals_of(*sessions[name])

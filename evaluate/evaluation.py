@@ -17,7 +17,7 @@ from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
 from graspq.common.options import flag
 from graspq.common.provenance import code_revision, versions
-from graspq.evaluate.films import write_films
+from graspq.evaluate.films import FilmKeeper, write_films
 from graspq.evaluate.jobs import Job
 from graspq.evaluate.object_sets import find_object_set
 from graspq.evaluate.policies import ACTOR, CEM, ORACLE, RANDOM, Policy, RandomObservationPolicy, UserPolicy
@@ -188,20 +188,9 @@ def run_prepared(
         UserError: the folder cannot be written, or a user's policy fails.
         RolloutError: an episode ends its simulator each time.
     """
-    from graspq.evaluate.rollout import run_episodes
-
-    job = prepared.job
     folder = writable_folder(prepared.folder, "evaluation")
     try:
-        rows, films = run_episodes(
-            stage_of(prepared),
-            prepared.policy,
-            episodes=job.episodes,
-            environments=job.environments,
-            workers=settings.workers,
-            films=settings.films,
-            on_row=on_row,
-        )
+        rows, films = play(prepared, settings, on_row)
     except BaseException:
         with contextlib.suppress(OSError):
             folder.rmdir()  # only if it is empty: nothing of an unfinished evaluation stays
@@ -209,6 +198,23 @@ def run_prepared(
     write_rows(folder, rows)
     write_films(folder, films.chosen())
     return write_summary(folder, _summary(prepared, rows))
+
+
+def play(
+    prepared: Prepared, settings: EvalSettings, on_row: Callable[[EpisodeRow], None] | None = None
+) -> tuple[Sequence[EpisodeRow], FilmKeeper]:
+    """Run the episodes of a prepared job; return their rows in order, and the films. See `rollout.run_episodes`."""
+    from graspq.evaluate.rollout import run_episodes
+
+    return run_episodes(
+        stage_of(prepared),
+        prepared.policy,
+        episodes=prepared.job.episodes,
+        environments=prepared.job.environments,
+        workers=settings.workers,
+        films=settings.films,
+        on_row=on_row,
+    )
 
 
 def stage_of(prepared: Prepared) -> Any:

@@ -87,9 +87,15 @@ class Policy(abc.ABC):
                 searches motions to a last pose keeps that inside the workspace by them, where they are given.
         """
 
-    def act_batch(self, images: np.ndarray, steps: np.ndarray, generators: Sequence[np.random.Generator]) -> np.ndarray:
+    def act_batch(
+        self,
+        images: np.ndarray,
+        steps: np.ndarray,
+        generators: Sequence[np.random.Generator],
+        poses: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the actions for N states, float32 [N, 4]; see `decide`."""
-        return self.decide(images, steps, generators).actions
+        return self.decide(images, steps, generators, poses).actions
 
     def act(self, image: np.ndarray, step: int, pose: np.ndarray | None = None) -> np.ndarray:
         """Return the action for one state, float32 [4]; noise comes from the policy's own generator, see `seed`."""

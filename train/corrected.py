@@ -61,6 +61,11 @@ class Judged(NamedTuple):
     value: Tensor
     q: Tensor
 
+    @property
+    def advantage(self) -> Tensor:
+        """A(s_t, a_t) = Q_θ'(s_t, a_t) - V(s_t) ≤ 0."""
+        return self.q - self.value
+
 
 def judged(batch: Batch, context: Context) -> Judged:
     """Return V and Q of the later steps by the lagged network; both networks' trunks run once for each.
@@ -90,8 +95,7 @@ def advantages(batch: Batch, seen: Judged, nu: float, context: Context) -> Tenso
 
     A(s_t, a_t) = Q_θ'(s_t, a_t) - V(s_t) ≤ 0,  or this centred, where the context says so
     """
-    sampled = seen.q - seen.value
-    return centred_advantage(batch, seen, nu, context) if context.centred else sampled
+    return centred_advantage(batch, seen, nu, context) if context.centred else seen.advantage
 
 
 def centred_advantage(batch: Batch, seen: Judged, nu: float, context: Context) -> Tensor:
@@ -110,11 +114,11 @@ def centred_advantage(batch: Batch, seen: Judged, nu: float, context: Context) -
         nu: ν.
         context: gives γ, and the other parts of the batch where ranks share it.
     """
-    later, advantage = later_steps(batch), seen.q - seen.value
-    target = corrected_episode_value(batch.reward, advantage, nu, context.discount, batch.mask)
+    later = later_steps(batch)
+    target = corrected_episode_value(batch.reward, seen.advantage, nu, context.discount, batch.mask)
     error = torch.where(later, target - seen.q, torch.zeros_like(target))
     total = context.part.sum_by_step(torch.stack([error.sum(0), later.sum(0).to(error.dtype)]))
-    return advantage + shifts(total[0], total[1], nu, context.discount)[: later.shape[1]]
+    return seen.advantage + shifts(total[0], total[1], nu, context.discount)[: later.shape[1]]
 
 
 def shifts(error: Tensor, episodes: Tensor, nu: float, discount: float) -> Tensor:

@@ -114,7 +114,10 @@ class TrainSettings(Settings):
         maximum=0.999999,
     )
     shift: int = _preset_setting("shift", help="Largest random shift of images, pixels.", minimum=0, maximum=32)
-    mirror: bool = _preset_setting("mirror", help="Mirror half of each batch about the scene's plane of symmetry.")
+    mirror: bool = _preset_setting(
+        "mirror",
+        help="Mirror half of each batch about the scene's plane of symmetry; corr-mc and blend look into it too.",
+    )
     jitter: float = _preset_setting(
         "jitter", help="Largest random relative change of contrast and brightness.", minimum=0, maximum=1
     )

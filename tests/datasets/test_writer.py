@@ -117,7 +117,7 @@ for first in range(0, 400, 4):
 def test_a_writer_killed_at_any_moment_leaves_a_valid_dataset_that_can_go_on(drawn, tmp_path):
     folder = tmp_path / "killed"
     folder.mkdir()
-    helpers = str(Path(__file__).with_name("conftest.py"))
+    helpers = str(Path(__file__).with_name("drawn_data.py"))
     drawn.manifest().save(folder)
     for shards, delay in ((1, 0.0), (2, 0.003), (3, 0.007)):
         arguments = [sys.executable, "-c", WRITER, helpers, str(folder)]
