@@ -5,6 +5,7 @@ OUT ?= data/$(TASK)-$(SIZE)
 SEED ?= 0
 TORCH_INDEX ?=
 TEST_WORKERS ?= 2
+BENCH ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +15,7 @@ QUICK := runs/quickstart
 QUICK_STEPS := 700
 export PYTHONUNBUFFERED := 1
 
-.PHONY: help setup quickstart test lint types data clean
+.PHONY: help setup quickstart test lint types data bench clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -45,6 +46,11 @@ quickstart: setup ## the whole job, small: objects, 2,000 grasps, mc and dql, sc
 	$(BIN)/grasp-eval $(QUICK)/mc $(QUICK)/dql --policy random --episodes 200 --out $(QUICK)/evaluations
 	$(BIN)/grasp-report $(QUICK) --out $(QUICK)/report.html
 	@echo "open $(QUICK)/report.html"
+
+bench: setup ## every published ratio: results/bench.json and the table in RESULTS.md (about an hour; goes on where it was stopped)
+	$(if $(wildcard data/regular-10k/manifest.json),,$(BIN)/grasp-datagen --size 10k --out data/regular-10k)
+	$(if $(wildcard runs/mc-regular-10k-seed0/config.json),,$(BIN)/grasp-train --algo mc --shards data/regular-10k)
+	$(BIN)/python benchmarks/bench.py $(BENCH)
 
 test: setup lint types ## everything that CI checks (at most 10 minutes)
 	$(BIN)/python -P -m pytest -n $(TEST_WORKERS) --dist loadfile

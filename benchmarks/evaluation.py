@@ -1,9 +1,9 @@
-"""Evaluation: episodes a second of `grasp-eval`'s lockstep against one environment at a time in as many processes.
+"""Evaluation: episodes a second of `grasp-eval` against one environment at a time in as many processes.
 
     python benchmarks/evaluation.py runs/mc-regular-10k-seed0
 
 The rivals decide for one state at a time: by the whole network on 64 tiled copies of the picture in every iteration of
-CEM, by the trunk anew in every iteration, and by the trunk once, which shows what lockstep alone is worth. All meet the
+CEM, by the trunk anew in every iteration, and by the trunk once, which shows what batches alone are worth. All meet the
 same scenes and draw the same noise; `--rival-episodes` lets the slow ones stop after the first of them. Ours starts its
 simulators within the clock, as `grasp-eval` does; the rivals' are ready before it.
 """
@@ -31,7 +31,7 @@ from graspq.evaluate.rollout import POLICY_PURPOSE
 from graspq.evaluate.settings import EvalSettings
 from graspq.evaluate.workers import Stage, begin_episode
 
-OURS = "graspq, lockstep"
+OURS = "graspq"
 Successes = dict[int, bool]
 
 
@@ -72,7 +72,7 @@ def searching(prepared: Prepared) -> QPolicy:
     return prepared.policy
 
 
-def lockstep(prepared: Prepared, settings: EvalSettings, into: list[Successes]) -> Callable[[], None]:
+def ours(prepared: Prepared, settings: EvalSettings, into: list[Successes]) -> Callable[[], None]:
     """Return what runs all episodes as `grasp-eval` does and keeps their successes."""
 
     def run() -> None:
@@ -104,13 +104,13 @@ def measure(prepared: Prepared, settings: EvalSettings, turns: int, rival_episod
             for number in range(workers)
         ]
         players = [stack.enter_context(player) for player in waiting]
-        runs = {OURS: lockstep(prepared, settings, found[OURS])}
+        runs = {OURS: ours(prepared, settings, found[OURS])}
         for way in WAYS:
             name = f"one at a time, {way}"
             runs[name] = crew(players, way, found[name])
         seconds = take_turns(runs, turns)
     pace = {name: [value / len(found[name][0]) for value in values] for name, values in seconds.items()}
-    ours = found[OURS][0]
+    expected = found[OURS][0]
     return [
         {
             "evaluation": name,
@@ -118,7 +118,7 @@ def measure(prepared: Prepared, settings: EvalSettings, turns: int, rival_episod
             "graspq is faster, times": median_ratio(values, pace[OURS]),
             "episodes": len(found[name][0]),
             "successes": sum(found[name][0].values()),
-            "end as ours": sum(ours[episode] == success for episode, success in found[name][0].items()),
+            "end as ours": sum(expected[episode] == success for episode, success in found[name][0].items()),
         }
         for name, values in pace.items()
     ]
@@ -132,7 +132,7 @@ def measure(prepared: Prepared, settings: EvalSettings, turns: int, rival_episod
 )
 @click.option("--turns", type=click.IntRange(1), default=3, show_default=True, help="Turns that are measured.")
 @click.option("--workers", type=click.IntRange(1), default=None, help="Processes; the number of cores if not given.")
-@click.option("--environments", type=click.IntRange(1), default=32, show_default=True, help="Ours, in lockstep.")
+@click.option("--environments", type=click.IntRange(1), default=32, show_default=True, help="Ours.")
 @click.option("--split", default="test", show_default=True, help="Split of the object set.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the scenes.")
 @click.option("--objects", type=click.Path(path_type=Path), default=None, help="Object set; the run's if not given.")
@@ -166,7 +166,7 @@ def main(
     facts = {
         "run": run.as_posix(),
         "workers of each": settings.workers,
-        "environments in lockstep": environments,
+        "our environments": environments,
         "threads of our decisions": torch.get_num_threads(),
         "threads of each rival's process": max(1, available_cores() // (settings.workers or 1)),
         "turns": turns,

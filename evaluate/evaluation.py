@@ -6,7 +6,7 @@ The scenes follow from the job; `eval.json` holds no times and no hosts, so the 
 import contextlib
 import json
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ from graspq.evaluate.records import (
     write_rows,
     write_summary,
 )
-from graspq.evaluate.settings import CemSettings, EvalSettings
+from graspq.evaluate.settings import GROUP, CemSettings, EvalSettings
 from graspq.evaluate.statistics import wilson_interval
 
 if TYPE_CHECKING:
@@ -93,6 +93,7 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
         "seed": job.seed,
         "episodes": job.episodes,
         "environments": job.environments,
+        "rows_of_a_batch": GROUP,  # they round together
         "object_set": objects.digest(),
         "policy": job.policy,
         "network": facts.network_sha256 if facts is not None else None,
@@ -206,15 +207,33 @@ def play(
     """Run the episodes of a prepared job; return their rows in order, and the films. See `rollout.run_episodes`."""
     from graspq.evaluate.rollout import run_episodes
 
-    return run_episodes(
-        stage_of(prepared),
-        prepared.policy,
-        episodes=prepared.job.episodes,
-        environments=prepared.job.environments,
-        workers=settings.workers,
-        films=settings.films,
-        on_row=on_row,
-    )
+    with _one_thread() if prepared.facts is not None else contextlib.nullcontext():
+        return run_episodes(
+            stage_of(prepared),
+            prepared.policy,
+            episodes=prepared.job.episodes,
+            environments=prepared.job.environments,
+            workers=settings.workers,
+            films=settings.films,
+            on_row=on_row,
+        )
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let PyTorch compute in one thread.
+
+    The simulators keep the cores busy, so threads of one decision would wait for each other: with two on two cores an
+    evaluation was a third slower. And rounding does not depend on the number of cores.
+    """
+    import torch
+
+    usual = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(usual)
 
 
 def stage_of(prepared: Prepared) -> Any:

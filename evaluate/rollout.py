@@ -1,7 +1,9 @@
-"""Lockstep rollouts: environments in worker processes, one batched decision in the parent for all of them.
+"""Rollouts in groups: environments in worker processes, one batched decision in the parent for each group of them.
 
-Episode i runs in slot i mod `environments`, its scene and its noise are functions of (seed, i), and every decision is
-made on a full batch with that slot's row: so no result depends on the number of workers or on what else runs.
+The environments of a group act in lockstep; while the parent decides for one group, the workers simulate the others.
+Episode i runs in slot i mod `environments`, its scene and its noise are functions of (seed, i), a group is a fixed set
+of slots, and every decision is made on a group's whole batch with that slot's row: so no result depends on the number
+of workers or on what else runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ from graspq.common.seeding import generator
 from graspq.evaluate.films import FilmKeeper
 from graspq.evaluate.policies import Policy
 from graspq.evaluate.records import EpisodeRow
+from graspq.evaluate.settings import GROUP
 from graspq.evaluate.workers import Begun, Command, Ended, Idle, Refused, Seen, Stage, start
 
 POLICY_PURPOSE = "evaluate/policy"
@@ -73,13 +76,15 @@ class Rollout:
             stage: what determines the scenes.
             policy: decides in the parent; None when the oracle acts in the workers (`stage.oracle`).
             episodes: number of episodes, at least 1; episode i is the same in a longer evaluation.
-            environments: number of slots, the rows of a batch.
+            environments: number of slots; `GROUP` of them are the rows of a batch.
             workers: processes; all cores by default.
             films: number of episodes whose frames are kept.
             on_row: called for each finished episode, in no fixed order.
         """
         self.stage, self.policy, self.episodes = stage, policy, episodes
         self.slots = [_Slot(list(range(slot, episodes, environments))) for slot in range(environments)]
+        numbers = range(environments)
+        self._groups = [numbers[first : first + GROUP] for first in numbers[::GROUP]]
         busy = min(environments, episodes)
         self.worker_count = max(1, min(workers or available_cores(), busy))
         self.films = FilmKeeper(films)
@@ -108,57 +113,61 @@ class Rollout:
         return [self.rows[episode] for episode in range(self.episodes)]
 
     def _loop(self) -> None:
-        while True:
-            self._collect()
-            active = [crew for crew in self._crews if any(self.slots[slot].episode is not None for slot in crew.slots)]
-            if not active:
-                return
-            actions = self._decide()
-            for crew in active:
-                waiting = [slot for slot in crew.slots if self.slots[slot].image is not None]
-                self._send(crew, [self._act(slot, actions) for slot in waiting])
+        while any(crew.pending for crew in self._crews):
+            self._listen()
+            unanswered = {command.slot for crew in self._crews for command in crew.pending}
+            for group in self._groups:
+                waiting = [slot for slot in group if self.slots[slot].image is not None]
+                if waiting and unanswered.isdisjoint(group):
+                    self._answer(group, waiting)
 
-    def _decide(self) -> np.ndarray | None:
+    def _answer(self, group: range, waiting: list[int]) -> None:
+        actions = self._decide(group)
+        for crew in self._crews:
+            self._send(crew, [self._act(slot, actions.get(slot)) for slot in crew.slots if slot in waiting])
+
+    def _decide(self, group: range) -> dict[int, np.ndarray]:
+        """Return the actions of a group's slots; none where the oracle acts."""
         if self.policy is None:
-            return None
-        shape = next(slot.image.shape for slot in self.slots if slot.image is not None)
-        images = np.zeros((len(self.slots), *shape), dtype=np.uint8)
-        steps = np.zeros(len(self.slots), dtype=np.int64)
-        for row, slot in enumerate(self.slots):
+            return {}
+        slots = [self.slots[number] for number in group]
+        shape = next(slot.image.shape for slot in slots if slot.image is not None)
+        images = np.zeros((len(slots), *shape), dtype=np.uint8)
+        steps = np.zeros(len(slots), dtype=np.int64)
+        for row, slot in enumerate(slots):
             if slot.image is not None:
                 images[row], steps[row] = slot.image, slot.step
-        poses = np.stack([slot.pose for slot in self.slots])
-        decision = self.policy.decide(images, steps, [slot.rng for slot in self.slots], poses)
+        poses = np.stack([slot.pose for slot in slots])
+        decision = self.policy.decide(images, steps, [slot.rng for slot in slots], poses)
         if decision.q is not None:
-            for row, slot in enumerate(self.slots):
+            for row, slot in enumerate(slots):
                 slot.q = float(decision.q[row])
-        return decision.actions
+        return {number: decision.actions[row].copy() for row, number in enumerate(group)}
 
     def _begin(self, slot: int) -> Command:
         return Command(slot, episode=self.slots[slot].episodes[0])
 
-    def _act(self, slot: int, actions: np.ndarray | None) -> Command:
+    def _act(self, slot: int, action: np.ndarray | None) -> Command:
         following = self.slots[slot].episodes[1] if len(self.slots[slot].episodes) > 1 else None
         self.slots[slot].image = None
-        return Command(slot, action=None if actions is None else actions[slot].copy(), following=following)
+        return Command(slot, action=action, following=following)
 
     def _send(self, crew: _Crew, commands: list[Command]) -> None:
-        crew.pending = commands
+        crew.pending += commands
         try:
             if commands:
                 crew.connection.send(commands)
         except (BrokenPipeError, ConnectionResetError):
             pass  # the worker is dead: reading from it says so
 
-    def _collect(self) -> None:
-        """Read until every command is answered; workers that die are replaced."""
-        while any(crew.pending for crew in self._crews):
-            ready = wait([crew.connection for crew in self._crews if crew.pending])
-            for crew in [crew for crew in self._crews if crew.connection in ready]:
-                try:
-                    self._heard(crew, crew.connection.recv())
-                except (EOFError, ConnectionResetError):
-                    self._replace(crew)
+    def _listen(self) -> None:
+        """Hear one message of each worker that has something to say; workers that die are replaced."""
+        ready = wait([crew.connection for crew in self._crews if crew.pending])
+        for crew in [crew for crew in self._crews if crew.connection in ready]:
+            try:
+                self._heard(crew, crew.connection.recv())
+            except (EOFError, ConnectionResetError):
+                self._replace(crew)
 
     def _heard(self, crew: _Crew, message: Begun | Seen | Ended | Idle | Refused) -> None:
         if isinstance(message, Refused):
@@ -210,6 +219,7 @@ class Rollout:
         for number in crew.slots:
             slot = self.slots[number]
             slot.episode, slot.rng, slot.image, slot.frames = None, None, None, []
+        crew.pending = []
         self._send(crew, [self._begin(slot) for slot in crew.slots if self.slots[slot].episodes])
 
     def _stop(self) -> None:

@@ -12,6 +12,7 @@ from graspq.common.options import Settings, parse_count, setting
 from graspq.train.selection import Answer, StepMode
 
 Device = Literal["auto", "cpu", "cuda"]
+GROUP = 8  # environments of a batch; larger ones are cheaper, but leave workers waiting for the slowest of them
 SYNTHETIC_STEP_HELP = (
     "How a motion of supervised becomes a step: scaled to the action limits, or each component clipped to them."
 )
@@ -61,7 +62,9 @@ class EvalSettings(Settings):
     )
     checkpoint: int | None = setting(None, help="Training step of the checkpoint. Default: the last.", minimum=0)
     workers: int | None = setting(None, help="Simulator processes, all cores by default; changes no result.", minimum=1)
-    environments: int = setting(32, help="Environments in lockstep, that is rows of a batch.", minimum=1, maximum=1024)
+    environments: int = setting(
+        32, help=f"Simulated environments; groups of {GROUP} act in lockstep, as a batch.", minimum=1, maximum=1024
+    )
     cem_iterations: int = setting(CemSettings.iterations, help="Iterations of CEM.", minimum=1, maximum=100)
     cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
     cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
