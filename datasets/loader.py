@@ -4,12 +4,13 @@ Blocks are read once per window, and the next window is read bit by bit while on
 the batches ahead. Dimension key: B batch, T steps, H W C image.
 """
 
+import contextlib
 import itertools
 import os
 import queue
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
@@ -26,44 +27,48 @@ READERS = min(4, os.cpu_count() or 1)
 DEFAULT_BUFFER_BYTES = 4 * 2**30
 
 
-class _ClosedError(Exception):
-    """The loader was closed while it was reading."""
-
-
 class _Buffer:
-    """The blocks in memory, by their index in the pool."""
+    """The blocks in memory, by their index in the pool, and those that are being read."""
 
-    def __init__(self, pool: ShardPool, stop: threading.Event | None = None) -> None:
-        self._pool, self._stop = pool, stop
+    def __init__(self, pool: ShardPool) -> None:
+        self._pool = pool
+        self._readers = ThreadPoolExecutor(READERS, "graspq-reader")
+        self._asked: dict[int, Future[BlockArrays]] = {}
         self.blocks: Blocks = {}
         self.bytes = self.peak_bytes = 0
 
     def missing(self, wanted: Int64) -> list[int]:
-        return [index for index in wanted.tolist() if index not in self.blocks]
+        """Return which blocks are neither here nor asked for."""
+        return [index for index in wanted.tolist() if index not in self.blocks and index not in self._asked]
 
-    def read(self, indices: list[int]) -> None:
-        if len(indices) <= 2 * READERS:
-            for index in indices:
-                self._add(index, self._pool.read_block(self._pool.blocks[index]))
-            return
-        with ThreadPoolExecutor(READERS) as executor:
-            refs = [self._pool.blocks[index] for index in indices]
-            try:
-                for index, block in zip(indices, executor.map(self._pool.read_block, refs), strict=True):
-                    self._add(index, block)
-            finally:
-                executor.shutdown(cancel_futures=True)
+    def ask(self, indices: list[int]) -> None:
+        """Let the readers begin with some blocks."""
+        for index in indices:
+            self._asked[index] = self._readers.submit(self._pool.read_block, self._pool.blocks[index])
 
-    def _add(self, index: int, block: BlockArrays) -> None:
-        if self._stop is not None and self._stop.is_set():
-            raise _ClosedError
-        self.blocks[index] = block
-        self.bytes += block.bytes
-        self.peak_bytes = max(self.peak_bytes, self.bytes)
+    def receive(self) -> None:
+        """Wait for all blocks that were asked for."""
+        for index in list(self._asked):
+            block = self._asked[index].result()
+            self.blocks[index] = block
+            del self._asked[index]
+            self.bytes += block.bytes
+            self.peak_bytes = max(self.peak_bytes, self.bytes)
 
     def keep(self, wanted: set[int]) -> None:
+        """Forget all blocks but these."""
         for index in self.blocks.keys() - wanted:
             self.bytes -= self.blocks.pop(index).bytes
+
+    def cancel(self) -> None:
+        """Begin no further block; whoever waits for one gets `CancelledError`."""
+        self._readers.shutdown(wait=False, cancel_futures=True)
+
+    def close(self) -> None:
+        """Stop the readers and forget all blocks."""
+        self._readers.shutdown(cancel_futures=True)
+        self._asked.clear()
+        self.keep(set())
 
 
 class _Loader(Generic[B]):
@@ -73,7 +78,7 @@ class _Loader(Generic[B]):
         self.pool, self.sampler = pool, sampler
         self.step = start_step
         self._stop = threading.Event()
-        self._buffer = _Buffer(pool, self._stop)
+        self._buffer = _Buffer(pool)
         self._thread: threading.Thread | None = None
         self._batches = self._produce(start_step)
         if prefetch > 0:
@@ -107,9 +112,10 @@ class _Loader(Generic[B]):
     def close(self) -> None:
         """Stop reading and free the buffer; closing twice does no harm."""
         self._stop.set()
+        self._buffer.cancel()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
-        self._buffer.keep(set())
+        self._buffer.close()
 
     def __enter__(self) -> Self:
         return self
@@ -148,8 +154,10 @@ class _Loader(Generic[B]):
             if resident != (epoch, touched):
                 windows = self.sampler.windows(epoch)
                 needed = np.concatenate([windows[window] for window in touched])
+                self._buffer.receive()
                 self._buffer.keep({*needed.tolist(), *following.tolist()})
-                self._buffer.read(self._buffer.missing(needed))
+                self._buffer.ask(self._buffer.missing(needed))
+                self._buffer.receive()
                 resident = epoch, touched
             yield self._gather(self.sampler.indices(epoch, step))
             if len(touched) == 1 and self.sampler.windows_per_epoch > 1:
@@ -161,13 +169,17 @@ class _Loader(Generic[B]):
         return windows[window] if window < len(windows) else self.sampler.windows(epoch + 1)[0]
 
     def _read_ahead(self, epoch: int, step: int, window: int, following: Int64) -> None:
-        """Read so much of the next window that it is there in time, spread evenly over the steps that are left."""
+        """Ask for so much of the next window that it is there in time, spread evenly over the steps that are left.
+
+        It is read while the next batch is gathered, and received after it.
+        """
+        self._buffer.receive()
         missing = self._buffer.missing(following)
         items_left = int(self.sampler.window_borders(epoch)[window + 1]) - (step + 1) * self.sampler.batch_size
         steps_left = max(1, items_left // self.sampler.batch_size)
-        self._buffer.read(missing[: -(-len(missing) // steps_left)])
+        self._buffer.ask(missing[: -(-len(missing) // steps_left)])
 
-    def _located(self, items: Int64) -> tuple[list[int], list[int]]:
+    def _located(self, items: Int64) -> tuple[Int64, Int64]:
         """Return the block, as its index in the pool, and the number within the block of each item."""
         return located(self.sampler.item_offsets, items)
 
@@ -259,12 +271,14 @@ def episode_batches(pool: ShardPool, batch_size: int, max_steps: int | None = No
 
 
 def _in_order(
-    pool: ShardPool, counts: list[int], batch_size: int, gather: Callable[[Blocks, list[int], list[int]], B]
+    pool: ShardPool, counts: list[int], batch_size: int, gather: Callable[[Blocks, Int64, Int64], B]
 ) -> Iterator[B]:
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    buffer = _Buffer(pool)
-    for start in range(0, int(offsets[-1]), batch_size):
-        owners, numbers = located(offsets, np.arange(start, min(start + batch_size, int(offsets[-1]))))
-        buffer.keep(set(owners))
-        buffer.read(buffer.missing(np.unique(owners)))
-        yield gather(buffer.blocks, owners, numbers)
+    with contextlib.closing(_Buffer(pool)) as buffer:
+        for start in range(0, int(offsets[-1]), batch_size):
+            owners, numbers = located(offsets, np.arange(start, min(start + batch_size, int(offsets[-1]))))
+            needed = np.unique(owners)
+            buffer.keep(set(needed.tolist()))
+            buffer.ask(buffer.missing(needed))
+            buffer.receive()
+            yield gather(buffer.blocks, owners, numbers)

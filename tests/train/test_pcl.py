@@ -163,11 +163,44 @@ def test_the_penalty_rises_above_the_bound_and_falls_below_it_within_its_limits(
     assert after(100.0, 9.0) == 100.0 and after(0.01, 0.0) == pytest.approx(0.01)
 
 
-def trained(action: Tensor, reward: Tensor, value: float, periods: int) -> tuple[Gaussian, list[float]]:
-    """Train one state's policy from a V for periods of 20 steps between lagged copies; return it and all losses."""
-    given = context(torch.zeros(1, 8), torch.zeros(1, 8), torch.full((1, 1), value), 0.3)
+class Normalised(StateNetwork):
+    """Outputs that depend on the step, normalised over the batch; its running mean is that of the last batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(1, momentum=1.0)
+        self.last = nn.Linear(1, 8)
+
+    def forward(self, image: Tensor, step: Tensor) -> Tensor:
+        output: Tensor = self.last(self.norm(step.float().unsqueeze(1)))
+        return output
+
+
+@pytest.mark.parametrize(("states", "mean"), [(100, 49.5), (300, 148.0)])  # all; 0, 4, 8, .. 296
+def test_evenly_spread_states_give_the_statistics_that_both_policies_use(states: int, mean: float) -> None:
+    networks = [Normalised() for _ in range(2)]
+    networks[1].load_state_dict(networks[0].state_dict())
+    networks[1].eval()
+    value = torch.zeros(states, 1)
+    given = plain_context(
+        {"actor": networks[0], "v": Outputs(value)},
+        {"actor": networks[1], "v": Outputs(value)},
+        loss="cross-entropy",
+        extra={"penalty": torch.tensor(0.25)},
+        penalty=None,
+    )
+    state = state_of(given)
+    path_consistency(state, episodes(torch.zeros(1, states, 4), torch.zeros(1, states)), ESTIMATORS["pcl"], given)
+    for network in networks:
+        assert float(network.norm.running_mean) == pytest.approx(mean)
+    # Two policies of equal weights did not differ: neither used the batch's own statistics.
+    assert float(given.extra["penalty"]) == pytest.approx(0.25 * math.exp(-0.02), rel=1e-3)
+
+
+def state_of(given: Context) -> TrainState:
+    """Return a training's state with a context's networks."""
     weights = {part: network.parameters() for part, network in given.networks.items()}
-    state = TrainState(
+    return TrainState(
         step=0,
         learned=given.networks,
         lagged=given.lagged_networks,
@@ -176,6 +209,12 @@ def trained(action: Tensor, reward: Tensor, value: float, periods: int) -> tuple
         extra=given.extra,
         parts={"v": 1, "actor": 8},
     )
+
+
+def trained(action: Tensor, reward: Tensor, value: float, periods: int) -> tuple[Gaussian, list[float]]:
+    """Train one state's policy from a V for periods of 20 steps between lagged copies; return it and all losses."""
+    given = context(torch.zeros(1, 8), torch.zeros(1, 8), torch.full((1, 1), value), 0.3)
+    state = state_of(given)
     losses = []
     for step in range(20 * periods):
         if step % 20 == 0:
