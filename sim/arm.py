@@ -28,7 +28,7 @@ class Arm:
         self.task = task
         self.client = world.client
         self.world = world
-        self.body = world.load_urdf(robot_model.panda_urdf(), fixed=True)
+        self.body = world.load_urdf(robot_model.panda_urdf(whole=world.gui), fixed=True)
         self.number = self.body.number
         self.fingers = robot_model.FINGER_LINKS
         # No shape of the arm touches another one; only hand and fingers have any.
@@ -85,11 +85,13 @@ class Arm:
 
     def move(self, pose: Sequence[float] | np.ndarray, steps: int, hold: int = 0) -> None:
         """Move in a straight line to a pose in `steps` simulation steps, then hold it for `hold` more."""
-        start, goal = self.commanded, np.array(pose, dtype=float)
+        # Plain numbers: NumPy's overhead on four of them would be felt at 240 set-points a second.
+        start, goal = self.commanded.tolist(), [float(value) for value in pose]
+        way = [there - here for here, there in zip(start, goal, strict=True)]
         for index in range(1, steps + 1):
             # Cosine easing: a jump in speed would jerk objects out of the gripper.
-            point = start + (goal - start) * (0.5 - 0.5 * math.cos(math.pi * index / steps))
-            joints = kinematics.joint_angles(*point.tolist())
+            eased = 0.5 - 0.5 * math.cos(math.pi * index / steps)
+            joints = kinematics.joint_angles(*[here + part * eased for here, part in zip(start, way, strict=True)])
             speeds = [(now - before) / self.world.time_step for now, before in zip(joints, self._joints, strict=True)]
             self._hold(joints, speeds)
             self._joints = joints
@@ -97,7 +99,7 @@ class Arm:
         if hold > 0:
             self._hold(self._joints, (0.0,) * 7)
             self.world.step(hold)
-        self.commanded = goal
+        self.commanded = np.array(goal)
 
     def _hold(self, joints: Sequence[float], speeds: Sequence[float]) -> None:
         bullet.setJointMotorControlArray(

@@ -79,18 +79,30 @@ class World:
         )
         return Body(self, number)
 
-    def add_box(self, half_extents: Vector, position: Vector, color: Vector, *, collides: bool = True) -> "Body":
+    def add_box(self, half_extents: Vector, position: Vector, color: Vector) -> "Body":
         """Add an immovable box (half extents and position in metres, colour RGBA in 0..1)."""
-        shape = -1
-        if collides:
-            shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half_extents, physicsClientId=self.client)
+        shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half_extents, physicsClientId=self.client)
         visual = bullet.createVisualShape(
             bullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=color, physicsClientId=self.client
         )
-        number = bullet.createMultiBody(
+        return Body(self, self._fixed_body(shape, visual, position))
+
+    def add_picture(self, boxes: Sequence[tuple[Vector, Vector]], position: Vector, color: Vector) -> "Body":
+        """Add an immovable body that nothing collides with: boxes by half extents and place in its frame, metres."""
+        visual = bullet.createVisualShapeArray(
+            shapeTypes=[bullet.GEOM_BOX] * len(boxes),
+            halfExtents=[half for half, _ in boxes],
+            visualFramePositions=[place for _, place in boxes],
+            rgbaColors=[color] * len(boxes),
+            physicsClientId=self.client,
+        )
+        return Body(self, self._fixed_body(-1, visual, position))
+
+    def _fixed_body(self, shape: int, visual: int, position: Vector) -> int:
+        number: int = bullet.createMultiBody(
             0, shape, visual, position, useMaximalCoordinates=True, physicsClientId=self.client
         )
-        return Body(self, number)
+        return number
 
     def close(self) -> None:
         """Disconnect; closing twice does nothing."""
