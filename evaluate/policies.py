@@ -51,7 +51,7 @@ class Policy(abc.ABC):
         seed: int = 0,
         device: Device = "auto",
     ) -> "Policy":
-        """Return the policy of a training run: CEM over its Q-function.
+        """Return the policy of a training run: CEM over its Q-function, or its actor (`ddpg`, `pcl`).
 
         Args:
             path: the run's folder.

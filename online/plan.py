@@ -13,7 +13,7 @@ from graspq.common.options import Settings, flag
 from graspq.online.settings import FIXED_BY_START, OnlineSettings
 from graspq.train.checkpoint import STATE_FILE, describe
 from graspq.train.run import Run
-from graspq.train.settings import PRESETS, TrainSettings
+from graspq.train.settings import TrainSettings, preset_values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _from_scratch(given: dict[str, Any]) -> dict[str, Any]:
     for name in ("algo", "shards"):
         if name not in given:
             raise UserError(f"{flag(name)}: is needed from scratch; give it, or a run to go on from with --start")
-    values = PRESETS[given.get("preset", "default")] | {"schedule": "constant"} | given
+    values = preset_values(given.get("preset", "default"), given["algo"]) | {"schedule": "constant"} | given
     return {name: value for name, value in values.items() if name != "steps"}
 
 

@@ -64,7 +64,8 @@ class OnlineSettings(Settings):
     )
     exploration_steps: int = setting(
         100_000,
-        help="Training steps (the start run's count) in which it gets there, such as 10k.",
+        help="Training steps (the start run's count) in which it gets there, such as 10k. The default is the released "
+        "code's; the paper's text prints 10000.",
         minimum=1,
         parse=parse_count,
         metavar="COUNT",

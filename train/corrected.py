@@ -5,16 +5,19 @@ N candidates.
 
 Differs:
 1. V(s) is the lagged network's Q of the best of N uniform actions and the logged one, or that of the logged one where
-   this is larger. Thus no advantage is above 0, as none of the true ones is. As in the released code θ picks the best
+   this is larger. Thus no advantage is above 0, as none of the true ones is,
+   before they are centred (3). As in the released code θ picks the best
    and θ' judges it; here θ picks on the mirror image of the state (unless `--no-mirror`), where its errors are others.
    A maximum over 17 independent values with deviation σ is too high by 1.79 σ; picked by another network, by 0.53 σ.
 2. Advantages are constants of the loss; the released code lets gradient through them.
 3. Advantages are centred (`--centred`, off with `--preset paper`); see `centred_advantage`.
-4. The lagged network is copied every `--lag-steps` 50 steps as for `dql`, every 100 in the released code.
+4. The lagged network is copied every `--lag-steps` 50 steps as for `dql`, every 100 in the released code and with
+   `--preset paper`.
 5. ν rises over the part `--anneal` of the training: over all of it, by default; over a twentieth with `--preset paper`,
    which is the released code's 100,000 of 2 million steps. The paper's text says "during training".
-6. A batch holds so many whole episodes that it has `--batch-size` transitions on average.
-7. The learning rate is that of all estimators; the released code's is 1e-4 for this one alone.
+6. A batch holds so many whole episodes that it has `--batch-size` transitions on average, also with `--preset paper`;
+   in the released code 32 counts episodes.
+7. The learning rate is that of all estimators; the released code's is 1e-4 for this one (`--preset paper`).
 
 Why 1, 3 and 5: where waiting costs no more than the discount, a V that is too high by δ at every step comes back as
 γ δ / (1 - γ), nine times as much, in Q of waiting; and the policy waits until T. Measured with `mc`'s recipe on 10,000

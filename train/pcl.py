@@ -24,8 +24,10 @@ configuration" is what the release holds of it, and where that is silent their c
 9. The policy's learning rate is a tenth of V's (`--actor-rate`, as for `ddpg`; 1 with `--preset paper`). At V's rate
    and with 256 transitions of the 10k dataset a batch, KL(π‖π') rose to 0.28 within one lagged copy while V had learned
    nothing, the mean of dphi swung from 1.0 to -1.1, and all states had the same action.
-10. The step is in the state, as for all rows (their configuration: not). Discount 0.9 as for all (their configuration:
-    0.95, `--discount`), V's learning rate as for all (theirs: 1e-4).
+10. The step is in the state, as for all rows (their configuration: not). Discount 0.9, batch and V's learning rate as
+    for all (their configuration: 0.95, 64 and 1e-4; `--preset paper`).
+11. With `--path-steps` V(s_{t+d}), through which gradient flows too, is of the same pass as V(s_t), with the batch's
+    statistics; of an own pass it would cost as much again.
 
 Bias: the square of a residual also counts the chance in transitions and rewards (as for every residual-gradient
 method); what a lucky transition brought is in part laid to the actions after it.

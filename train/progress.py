@@ -18,7 +18,8 @@ from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
 from graspq.train.validation import Validation
 
-# Of mean absolute values of returns, which lie in [0, 1].
+# Of mean absolute values of returns, which lie in [0, 1]. Its square is that of the loss: where Q is a probability it
+# cannot leave its range, but the outputs behind it can.
 LARGEST = 10.0
 
 
@@ -77,7 +78,7 @@ class Progress:
 
         Returns:
             The first step that diverged and what was found there, else None. Returns lie in [0, 1]: a mean beyond ±10
-            is no estimate of one.
+            is no estimate of one, nor is one whose loss is beyond ±100.
         """
         if not self._losses:
             return None
@@ -110,6 +111,8 @@ class Progress:
                 value = float(values[index])
                 if not abs(value) <= LARGEST:
                     return self._first + index, f"mean |{name}| is {value:.3g}, and returns lie in [0, 1]"
+            if abs(loss) > LARGEST**2:
+                return self._first + index, f"loss is {loss:.3g}, and returns lie in [0, 1]"
         return None
 
     def log_validation(self, step: int, result: Validation) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from graspq.common.errors import UserError
-from graspq.common.options import Settings, parse_count, setting
+from graspq.common.options import Settings, flag, parse_count, setting
 from graspq.datasets.loader import DEFAULT_BUFFER_BYTES
 from graspq.train.estimators import ESTIMATORS, estimator_named
 from graspq.train.updates import LossName
@@ -39,6 +39,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "actor_every": 2,
         "path_steps": None,
         "penalty": None,
+        "lag_steps": 50,
         "precision": "auto",
     },
     # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
@@ -63,15 +64,30 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "actor_every": 1,
         "path_steps": 10,
         "penalty": 3.0,
+        "lag_steps": 50,
         "precision": "float32",
     },
 }
+# Where the authors' code has settings of its own for an estimator, and the paper does not say otherwise.
+PAPER_BY_ALGO: dict[str, dict[str, Any]] = {
+    "corr-mc": {"learning_rate": 1e-4, "lag_steps": 100},
+    "pcl": {"learning_rate": 1e-4, "batch_size": 64, "discount": 0.95},
+}
+
+
+def preset_values(preset: PresetName, algo: str) -> dict[str, Any]:
+    """Return what a preset gives an estimator."""
+    return PRESETS[preset] | (PAPER_BY_ALGO.get(algo, {}) if preset == "paper" else {})
 
 
 def _preset_setting(name: str, *, help: str, **more: Any) -> Any:
     values = {preset: PRESETS[preset][name] for preset in PRESETS}
     shown = "; ".join(f"{preset}: {value}" for preset, value in values.items())
     return setting(values["default"], help=f"{help} [{shown}]", **more)
+
+
+def _listed(values: dict[str, Any]) -> str:
+    return ", ".join(f"{flag(name)} {value}" for name, value in values.items())
 
 
 def _algorithm(text: str) -> str:
@@ -91,11 +107,16 @@ class TrainSettings(Settings):
     shards: tuple[str, ...] = setting(help="Dataset folders, shard files or globs; several may follow.")
     out: Path | None = setting(None, help="Run folder; runs/ALGO-DATASET-seedSEED where it is not given.")
     seed: int = setting(0, help="Seed of weights, sample order, augmentation and candidates.", minimum=0)
-    preset: PresetName = setting("default", help="Values of all options marked with two values in brackets.")
+    preset: PresetName = setting(
+        "default",
+        help="Values of all options marked with two values in brackets; paper has some of its own for "
+        + "; ".join(f"{algo}: {_listed(values)}" for algo, values in PAPER_BY_ALGO.items())
+        + ".",
+    )
     steps: int = _preset_setting("steps", help="Gradient steps, such as 8000 or 8k.", minimum=1, parse=parse_count)
     network: Literal["default", "paper"] = _preset_setting("network", help="Q-network.")
     width: int = setting(32, help="Channels and units of the paper's network.", minimum=1)
-    loss: LossName = _preset_setting("loss", help="Loss between Q and target.")  # noqa: RUF009
+    loss: LossName = _preset_setting("loss", help="Loss between Q and target; pcl has its own.")  # noqa: RUF009
     batch_size: int = _preset_setting("batch_size", help="Transitions of a gradient step.", minimum=2)
     learning_rate: float = _preset_setting("learning_rate", help="Highest learning rate of AdamW.", minimum=0)
     weight_decay: float = _preset_setting(
@@ -163,7 +184,9 @@ class TrainSettings(Settings):
         minimum=0,
         maximum=1,
     )
-    lag_steps: int = setting(50, help="Steps between copies of the weights into the lagged network.", minimum=1)
+    lag_steps: int = _preset_setting(
+        "lag_steps", help="Steps between copies of the weights into the lagged network.", minimum=1
+    )
     candidates: int = setting(16, help="Uniform actions among which a target looks for the best.", minimum=1)
     validation_fraction: float = setting(
         0.05, help="Part of the blocks held back for validation, 0 to below 1.", minimum=0, maximum=0.9
@@ -242,11 +265,11 @@ def resolve(options: Settings) -> TrainSettings:
         UserError: a value is unknown or out of range.
     """
     given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    preset = PRESETS[given["preset"]]
+    preset = preset_values(given["preset"], given["algo"])
     values: dict[str, Any] = {name: preset.get(name) if value is None else value for name, value in given.items()}
     return TrainSettings(**values)
 
 
 def preset_settings(preset: PresetName, **given: Any) -> TrainSettings:
     """Return the settings of a preset with those given on top, as the command line would."""
-    return TrainSettings(**PRESETS[preset] | {"preset": preset} | given)
+    return TrainSettings(**preset_values(preset, given["algo"]) | {"preset": preset} | given)

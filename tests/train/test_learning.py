@@ -1,7 +1,8 @@
 """Every estimator learns what it ought to on a stochastic decision process that is solved exactly; see `tiny_mdp.py`.
 
 Off-policy data, continuous actions, discount 0.9, cross-entropy. Distances are max |Q_θ - Q| over steps, places and a
-grid of 21 × 21 actions.
+grid of 21 × 21 actions. `pcl` learns on a mirrored process of two places and uniform actions: where what follows is
+uncertain, the square of a residual is not least at the optimum (see `pcl`, Bias), and no tolerance would mean much.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,7 +23,7 @@ from graspq.train.selection import cem_noise, cross_entropy_method
 from graspq.train.settings import TrainSettings, preset_settings
 from graspq.train.state import TrainState, seeded
 
-NEAR, GAP = 0.15, 0.25
+NEAR, GAP = 0.12, 0.25
 Q_STAR = tiny_mdp.solve(tiny_mdp.largest)
 Q_BEHAVIOUR = tiny_mdp.solve(tiny_mdp.behaviour_mean)
 
@@ -49,6 +50,8 @@ def short(**given: Any) -> TrainSettings:
         "average_decay": 0.99,
         "lag_steps": 25,
         "anneal": 0.3,
+        # 800 steps are few for an actor at a tenth of Q's rate.
+        "actor_rate": 1.0,
     }
     return preset_settings("default", **values | given)
 
@@ -69,7 +72,7 @@ def test_the_exact_solutions_satisfy_their_equations_and_lie_apart() -> None:
         assert Q_STAR[step, place, i, j] == pytest.approx(bellman, abs=1e-12)
     assert np.abs(Q_STAR - Q_BEHAVIOUR).max() == pytest.approx(0.316, abs=0.001)
     for wrong in (0.7, 1.0):
-        assert np.abs(Q_STAR - tiny_mdp.solve(tiny_mdp.largest, wrong)).max() > NEAR
+        assert np.abs(Q_STAR - tiny_mdp.solve(tiny_mdp.largest, wrong)).max() > 0.15
 
 
 def test_the_observed_returns_have_the_mean_of_the_behaviours_exact_values(data: tiny_mdp.Data) -> None:
@@ -79,16 +82,13 @@ def test_the_observed_returns_have_the_mean_of_the_behaviours_exact_values(data:
         assert float(returns.mean()) == pytest.approx(exact, abs=5 * float(returns.std()) / len(returns) ** 0.5)
 
 
-# An actor is a little off the best action, and so are its targets.
-@pytest.mark.parametrize(("algo", "near"), [("dql", 0.12), ("corr-mc", 0.12), ("ddpg", 0.13), ("blend", 0.12)])
-def test_bootstrapped_and_corrected_estimators_reach_the_optimal_values(
-    algo: str, near: float, data: tiny_mdp.Data
-) -> None:
+@pytest.mark.parametrize("algo", ["dql", "corr-mc", "ddpg", "blend"])
+def test_bootstrapped_and_corrected_estimators_reach_the_optimal_values(algo: str, data: tiny_mdp.Data) -> None:
     state = learned(algo, data)
-    assert distance(state, Q_STAR) < near
+    assert distance(state, Q_STAR) < NEAR
     assert distance(state, Q_BEHAVIOUR) > GAP
     for wrong in (0.7, 1.0):
-        assert distance(state, tiny_mdp.solve(tiny_mdp.largest, wrong)) > near + 0.05
+        assert distance(state, tiny_mdp.solve(tiny_mdp.largest, wrong)) > distance(state, Q_STAR) + 0.03
 
 
 def test_mc_reaches_the_behaviours_values_and_misses_the_optimal_ones(data: tiny_mdp.Data) -> None:

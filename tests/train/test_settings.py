@@ -25,6 +25,19 @@ def test_the_paper_preset_has_the_papers_settings() -> None:
     assert settings.lag_steps == 50
     assert settings.candidates == 16
     assert settings.steps == 2_000_000
+    assert (settings.anneal, settings.centred) == (0.05, False), "100,000 of 2 million steps"
+    assert (settings.actor_rest, settings.actor_rate, settings.actor_every) == (0.0, 1.0, 1)
+    assert (settings.path_steps, settings.penalty, settings.precision) == (10, 3.0, "float32")
+
+
+def test_the_paper_preset_has_what_the_authors_code_has_for_one_estimator_alone() -> None:
+    corrected, paths = given(algo="corr-mc", preset="paper"), given(algo="pcl", preset="paper")
+    assert (corrected.learning_rate, corrected.lag_steps, corrected.batch_size) == (1e-4, 100, 32)
+    assert (paths.learning_rate, paths.lag_steps, paths.batch_size, paths.discount) == (1e-4, 50, 64, 0.95)
+    assert preset_settings("paper", algo="pcl", shards=("data",)) == paths
+    chosen = given(algo="pcl", preset="paper", discount=0.9, learning_rate=0.01, batch_size=32, lag_steps=7)
+    assert (chosen.discount, chosen.learning_rate, chosen.batch_size, chosen.lag_steps) == (0.9, 0.01, 32, 7)
+    assert given(algo="pcl").learning_rate == given(algo="dql").learning_rate
 
 
 def test_options_that_are_given_win_over_the_preset_even_when_they_are_its_opposite_or_zero() -> None:

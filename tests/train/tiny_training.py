@@ -113,7 +113,12 @@ def context(state: TrainState, settings: TrainSettings, generator: torch.Generat
         anneal=settings.anneal,
         centred=settings.centred,
         mirror=settings.mirror,
+        actor_rest=settings.actor_rest,
+        actor_rate=settings.actor_rate,
+        actor_every=settings.actor_every,
+        path_steps=settings.path_steps,
         penalty=settings.penalty,
+        kl_bound=settings.kl_bound,
         extra=state.extra,
     )
 
