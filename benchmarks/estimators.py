@@ -15,6 +15,7 @@ import click
 from sessions import default_settings, ready, steps_on
 from timing import median_ratio, report, take_turns
 
+from graspq.common.options import Command
 from graspq.datasets.dataset import open_shards
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.loop import session
@@ -22,7 +23,7 @@ from graspq.train.loop import session
 RIVAL = "mc"
 
 
-@click.command()
+@click.command(cls=Command)
 @click.option("--shards", multiple=True, required=True, help="Dataset folders, shard files or globs.")
 @click.option("--turns", type=click.IntRange(1), default=5, show_default=True, help="Turns that are measured.")
 @click.option("--steps", type=click.IntRange(1), default=6, show_default=True, help="Steps of each in a turn.")

@@ -68,7 +68,9 @@ def render(findings: Findings, title: str | None = None) -> str:
         lead=_lead(first),
         cards=_cards(findings, first),
         panels=[panel_of(key, scores, findings.runs, colors) for key, scores in findings.panels.items()],
-        stability=[one for one in (stability_of(sweep, PALETTE) for sweep in findings.sweeps) if one is not None],
+        stability=[
+            one for one in (stability_of(sweep, colors, PALETTE) for sweep in findings.sweeps) if one is not None
+        ],
         curves=learning_curves(findings.runs, colors),
         calibration=calibration_charts(findings, colors),
         films=film_groups(findings),

@@ -5,7 +5,7 @@ The table of a sweep, `sweep.jsonl`, is all that is read: a row for each job wit
 
 import json
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,14 +74,15 @@ def _read(path: Path) -> Sweep:
     return Sweep(path.parent, rows)
 
 
-def stability_of(sweep: Sweep, palette: int) -> dict[str, Any] | None:
+def stability_of(sweep: Sweep, colors: Mapping[str, int], palette: int) -> dict[str, Any] | None:
     """Return a sweep's figure and its rows of numbers; None before its first job is finished.
 
     Args:
         sweep: the sweep.
+        colors: of the runs that the page shows, by name: an estimator has that of its best run.
         palette: number of colours of the page.
     """
-    chart = stability_chart(sweep, palette)
+    chart = stability_chart(sweep, colors, palette)
     if chart is None:
         return None
     finished = sum(len(sweep.rates(algo)) for algo in sweep.estimators)
@@ -89,8 +90,10 @@ def stability_of(sweep: Sweep, palette: int) -> dict[str, Any] | None:
     return {"chart": chart, "rows": rows, "finished": finished, "jobs": len(sweep.rows)}
 
 
-def stability_chart(sweep: Sweep, palette: int) -> LineChart | None:
+def stability_chart(sweep: Sweep, colors: Mapping[str, int], palette: int) -> LineChart | None:
     """Return success over rank: for each estimator all its finished jobs, sorted by success, best first.
+
+    See `stability_of` for the arguments.
 
     Source: Quillen et al. 2018, figure on hyperparameter sensitivity in section "Analyzing Stability".
     Differs: 1. A job that failed, such as by diverging, stands at 0; the paper does not say what it does with those.
@@ -100,7 +103,7 @@ def stability_chart(sweep: Sweep, palette: int) -> LineChart | None:
     series = [
         Series(
             algo,
-            index % palette,
+            colors.get(sweep.best(algo)["id"] if rates else "", index % palette),
             [(float(rank), rate) for rank, rate in enumerate(rates, start=1)],
             dots=[3.5] * len(rates) if most <= MOST_DOTS else (),
         )

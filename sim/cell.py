@@ -48,9 +48,9 @@ def _add_table(world: World, x: float, bin_half: float) -> None:
     """
     length, width, hole = *_TABLE, bin_half - _OVERLAP
     ends = [(-length, _TABLE_BEHIND - hole), (_TABLE_BEHIND + hole, length)]
-    boxes = [(((stop - start) / 2, width, 0.01), ((start + stop) / 2, 0, 0)) for start, stop in ends]
+    boxes = [(((stop - start) / 2, width, 0.01), ((start + stop) / 2, 0.0, 0.0)) for start, stop in ends]
     side = (width - hole) / 2
-    boxes += [((hole, side, 0.01), (_TABLE_BEHIND, sign * (hole + side), 0)) for sign in (-1, 1)]
+    boxes += [((hole, side, 0.01), (_TABLE_BEHIND, sign * (hole + side), 0.0)) for sign in (-1, 1)]
     world.add_picture(boxes, (x - _TABLE_BEHIND, 0, -0.022), _TABLE_COLOR)
 
 

@@ -56,8 +56,8 @@ def train(
 
     Raises:
         UserError: data, run folder or a setting are not usable; see the message.
-        DivergedError: a loss or weight was not finite, or values far beyond [0, 1]; the newest checkpoint is from
-            before.
+        DivergedError: a loss or weight was not finite, or values far beyond [0, 1]; the newest checkpoint that is left
+            is from before.
         KeyboardInterrupt: SIGINT or SIGTERM came; a checkpoint of the last step was written first.
     """
     pool = open_shards(settings.shards)
@@ -285,8 +285,10 @@ class Session:
         self.saved_step = self.state.step
 
     def _diverged(self, step: int, found: str) -> None:
+        # What an update found was so with the weights that the one before it had left.
+        self.run.forget_checkpoints_from(step - 1)
         newest = self.run.latest_checkpoint()
-        kept = f"{newest} is the last good checkpoint" if newest is not None else "no checkpoint was written yet"
+        kept = f"{newest} is the last good checkpoint" if newest is not None else "no good checkpoint was written yet"
         raise DivergedError(
             f"{self.settings.algo} diverged at step {step}: the {found}; {kept}; "
             "try a lower --learning-rate with another --out"

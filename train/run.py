@@ -159,6 +159,12 @@ class Run:
         for path in self.checkpoints()[:-keep]:
             shutil.rmtree(path)
 
+    def forget_checkpoints_from(self, step: int) -> None:
+        """Remove the checkpoints of a step and of later ones."""
+        for path in self.checkpoints():
+            if (step_of(path) or 0) >= step:
+                shutil.rmtree(path)
+
     @property
     def metrics_file(self) -> Path:
         """Where the metrics are."""
@@ -198,6 +204,9 @@ class Witness(Run):
         self.config[name] = value
 
     def prune(self, keep: int) -> None:
+        """Do nothing."""
+
+    def forget_checkpoints_from(self, step: int) -> None:
         """Do nothing."""
 
     def append_metrics(self, row: dict[str, Any]) -> None:

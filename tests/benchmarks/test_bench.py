@@ -73,7 +73,7 @@ def test_a_finished_part_is_not_run_again_and_a_failed_one_leaves_nothing(
     assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text and "| 30 |" in text
     # Measured again, by a command that fails: what was measured before stays.
     monkeypatch.setitem(bench.PARTS, "decision", bench.Part("decision", ("--turns", "0")))
-    failed = CliRunner().invoke(bench.main, [*given, "--again", "decision"])
+    failed = CliRunner().invoke(bench.main, [*given, "--part", "decision", "--again", "decision"])
     assert failed.exit_code == 2
     assert [path.name for path in work.iterdir()] == ["decision.json"]
     assert page.read_text() == text

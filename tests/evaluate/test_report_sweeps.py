@@ -36,7 +36,7 @@ def test_runs_are_sorted_by_success_and_one_that_failed_stands_at_zero(sweep: Sw
 
 
 def test_the_figure_is_success_over_rank_for_each_estimator(sweep: Sweep) -> None:
-    chart = stability_chart(sweep, 8)
+    chart = stability_chart(sweep, {}, 8)
     assert chart is not None
     dql, mc = chart.series
     assert ([dql.name, mc.name], [dql.color, mc.color]) == (["dql", "mc"], [0, 1])
@@ -50,8 +50,13 @@ def test_the_figure_is_success_over_rank_for_each_estimator(sweep: Sweep) -> Non
     assert "dql: 0.75, 0.50, 0.25, 0.00; mc: 0.50." in chart.description
 
 
+def test_an_estimator_has_the_colour_that_its_best_run_has_elsewhere_on_the_page(sweep: Sweep) -> None:
+    chart = stability_chart(sweep, {"dql-1": 5, "dql-0": 3, "mc-0": 0}, 8)
+    assert chart is not None and [one.color for one in chart.series] == [5, 0]
+
+
 def test_numbers_beside_the_figure(sweep: Sweep) -> None:
-    found = stability_of(sweep, 8)
+    found = stability_of(sweep, {}, 8)
     assert found is not None
     assert (found["finished"], found["jobs"]) == (5, 6)
     assert found["rows"][0] == {
@@ -61,7 +66,7 @@ def test_numbers_beside_the_figure(sweep: Sweep) -> None:
 
 def test_a_sweep_without_a_finished_job_has_no_figure_yet(sweep: Sweep) -> None:
     rows = [row | {"status": "to do", "success_rate": None} for row in sweep.rows]
-    assert stability_of(Sweep(sweep.folder, rows), 8) is None
+    assert stability_of(Sweep(sweep.folder, rows), {}, 8) is None
 
 
 def test_a_page_on_a_sweep_shows_the_figure_and_of_its_runs_the_best_of_each_estimator(

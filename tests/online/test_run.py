@@ -23,6 +23,7 @@ from graspq.online import growth
 from graspq.online.plan import Plan
 from graspq.online.run import run_online
 from graspq.train import loop
+from graspq.train.estimators import ESTIMATORS
 from graspq.train.run import Run
 
 Make = Callable[..., Plan]
@@ -188,13 +189,17 @@ def test_a_run_of_rounds_is_no_start_of_another(make_plan: Make, unbroken: Run, 
         make_plan(tmp_path / "run", start=unbroken.folder)
 
 
-def test_from_scratch_the_pool_alone_is_needed(base: Path, make_plan: Make, tmp_path: Path) -> None:
+@pytest.mark.parametrize("algo", ESTIMATORS)
+def test_from_scratch_every_estimator_needs_the_pool_alone_and_collects_by_its_latest_weights(
+    base: Path, make_plan: Make, tmp_path: Path, algo: str
+) -> None:
     plan = make_plan(
-        tmp_path / "run", start=None, algo="mc", shards=(str(base),), preset="paper", width=8, batch_size=8,
-        rounds=1, grasps=2, steps_per_round=2, threads=1, device="cpu", validation_fraction=0.3,
+        tmp_path / "run", start=None, algo=algo, shards=(str(base),), preset="paper", width=4, batch_size=8,
+        rounds=2, grasps=1, steps_per_round=1, exploration_end=0.0, exploration_steps=1, threads=1, device="cpu",
+        validation_fraction=0.2, cem_samples=8, cem_elites=2,
     )  # fmt: skip
     run = run_online(plan)
     dataset = Dataset.open(run.folder / "dataset")
-    rows = dataset.episode_rows(dataset.manifest.shards[0])
-    assert [(row["policy"], row["exploration"]) for row in rows] == [("mc@0", 1.0)] * 2
+    rows = [row for entry in dataset.manifest.shards for row in dataset.episode_rows(entry)]
+    assert [(row["policy"], row["exploration"]) for row in rows] == [(f"{algo}@0", 1.0), (f"{algo}@1", 0.0)]
     assert run.config["online"]["start"] is None and run.checkpoint().name == "step-00000002"

@@ -63,6 +63,21 @@ def test_auto_streams_on_a_cpu_and_what_was_asked_for_is_done() -> None:
     assert [is_resident(asked, CPU, 1) for asked in ("auto", "yes", "no")] == [False, True, False]
 
 
+def test_auto_keeps_images_on_a_gpu_where_they_take_three_fifths_of_its_free_memory_or_less(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gpu, asked_of = torch.device("cuda", 1), []
+
+    def free_and_total(device: torch.device) -> tuple[int, int]:
+        asked_of.append(device)
+        return 1_000_000, 5_000_000
+
+    monkeypatch.setattr(torch.cuda, "mem_get_info", free_and_total)
+    assert [is_resident("auto", gpu, needed) for needed in (1, 600_000, 600_001)] == [True, True, False]
+    assert asked_of == [gpu] * 3
+    assert [is_resident(asked, gpu, 4_000_000) for asked in ("yes", "no")] == [True, False]
+
+
 def test_images_that_fit_nowhere_are_refused_in_one_line(dataset: Path) -> None:
     pool = open_shards([dataset])
     first = dataclasses.replace(pool.blocks[0], rows=2**52)

@@ -1,14 +1,17 @@
 """The choice of device and arithmetic."""
 
 import copy
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from graspq.common.errors import UserError
+from graspq.train import hardware
 from graspq.train.hardware import (
     Precision,
+    PrecisionName,
     _faster_compiled,
     chosen_compilation,
     chosen_device,
@@ -16,7 +19,7 @@ from graspq.train.hardware import (
     compile_networks,
     keep_freed_memory,
 )
-from graspq.train.networks import NetworkSpecification, make_network
+from graspq.train.networks import NetworkSpecification, QNetwork, make_network
 from graspq.train.state import seeded
 
 SPECIFICATION = NetworkSpecification("default", (16, 16, 3), 4, 15, "logistic")
@@ -92,3 +95,49 @@ def test_a_compiler_that_fails_is_not_taken_and_the_reason_is_kept() -> None:
 
     taken, probe = _faster_compiled(network, precision, (16, 16, 3), broken)  # type: ignore[arg-type]
     assert not taken and "no compiler here" in probe["failed"]
+
+
+@pytest.mark.parametrize(("compiled_seconds", "faster"), [(0.25, True), (0.5, False), (0.75, False)])
+def test_what_is_compiled_right_is_taken_where_it_is_faster_and_the_network_stays_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, compiled_seconds: float, faster: bool
+) -> None:
+    network, precision = make_network(SPECIFICATION, seeded("tests/weights")), Precision("float32", torch.device("cpu"))
+    before, measured = copy.deepcopy(network.state_dict()), hardware._trial
+
+    def timed(tried: QNetwork, *settings: Any) -> tuple[Tensor, float]:
+        return measured(tried, *settings)[0], compiled_seconds if "trunk" in vars(tried) else 0.5
+
+    monkeypatch.setattr(hardware, "_trial", timed)
+    taken, probe = _faster_compiled(network, precision, (16, 16, 3), "eager")
+    assert taken is faster
+    assert probe["milliseconds"] == {"plain": 500.0, "compiled": 1000 * compiled_seconds}
+    assert probe["asked"] == "auto" and 0 <= probe["root_mean_square_difference"] < 1e-5
+    assert "trunk" not in vars(network) and all(parameter.grad is None for parameter in network.parameters())
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("name", "off", "right"),
+    [
+        ("float32", 0.009, True),
+        ("float32", 0.011, False),
+        ("bfloat16", 0.29, True),
+        ("bfloat16", 0.31, False),
+        ("float32", float("nan"), False),
+    ],
+)
+def test_on_a_gpu_compiled_networks_whose_q_is_off_by_more_than_the_tolerance_are_not_taken_however_fast(
+    monkeypatch: pytest.MonkeyPatch, name: PrecisionName, off: float, right: bool
+) -> None:
+    network, q = make_network(SPECIFICATION, seeded("tests/weights")), torch.linspace(0.3, 0.4, 64)
+
+    def given(tried: QNetwork, *settings: Any) -> tuple[Tensor, float]:
+        return (q + off * q.std(), 0.001) if "trunk" in vars(tried) else (q, 1.0)
+
+    monkeypatch.setattr(hardware, "_trial", given)
+    precision = Precision(name, torch.device("cuda"))
+    taken, probe = chosen_compilation("auto", network, precision, (16, 16, 3), "eager")
+    assert taken is right
+    difference = probe["root_mean_square_difference"]
+    assert isinstance(difference, float if right else str)
+    assert float(difference) == pytest.approx(off * float(q.std()), rel=1e-3, nan_ok=True)

@@ -144,6 +144,19 @@ def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
     assert not torch.equal(first["last.weight"], other["last.weight"])
 
 
+@pytest.mark.parametrize("name", list(NETWORKS))
+def test_filters_of_a_fresh_network_lie_channels_last_in_memory_as_the_images_do(name: str) -> None:
+    made = [
+        make_network(specification(name), seeded("tests/weights")),
+        make_state_network(specification(name), 8, seeded("tests/weights")),
+    ]
+    for network in made:
+        filters = [weights for weights in network.parameters() if weights.dim() == 4]
+        assert all(weights.is_contiguous(memory_format=torch.channels_last) for weights in filters)
+        # Filters of one pixel or one channel lie both ways.
+        assert sum(not weights.is_contiguous() for weights in filters) >= 3
+
+
 @pytest.mark.parametrize(("name", "size"), [("default", 20), ("default", 8), ("paper", 14)])
 def test_images_that_a_network_cannot_take_are_refused_in_one_line(name: str, size: int) -> None:
     with pytest.raises(UserError, match="images of"):

@@ -3,6 +3,7 @@
 That `pcl` reaches the regularised optimum of a known decision process stands in `test_learning`.
 """
 
+import dataclasses
 import math
 
 import pytest
@@ -85,6 +86,23 @@ def test_at_the_first_step_it_is_the_corrected_episode_value_less_the_first_pena
     )
 
 
+def test_with_paths_of_one_step_the_target_follows_the_next_value_by_the_discount_and_its_own_ratio_alone() -> None:
+    reward, value, ratio = numbers(2, 4, seed=1), numbers(2, 4, seed=2), numbers(2, 4, seed=3)
+    discount, penalty = 0.7, 0.3
+    # [B, T] of the target by [B, T] of what it may follow.
+    by_value, by_ratio = torch.autograd.functional.jacobian(
+        lambda v, rho: path_consistent(reward, v, rho, penalty, discount, 1, MASK), (value, ratio)
+    )
+    next_value, own_ratio = torch.zeros(2, 2, 4, 2, 4, dtype=torch.float64)
+    for b, length in enumerate(MASK.sum(1).tolist()):
+        for t in range(length):
+            own_ratio[b, t, b, t] = -penalty
+            if t + 1 < length:
+                next_value[b, t, b, t + 1] = discount
+    torch.testing.assert_close(by_value, next_value, rtol=0, atol=1e-12)
+    torch.testing.assert_close(by_ratio, own_ratio, rtol=0, atol=1e-12)
+
+
 class Outputs(StateNetwork):
     """A function of the step alone: row `step` of a table."""
 
@@ -134,6 +152,41 @@ def test_the_loss_is_half_the_mean_squared_residual_of_real_steps_with_the_given
     torch.testing.assert_close(consistent_value(batch, given), target)
     expected = 0.5 * (v - target)[MASK].square().mean()
     torch.testing.assert_close(residual(batch, ESTIMATORS["pcl"], given), expected)
+
+
+def test_the_gradient_flows_through_the_value_at_both_ends_of_a_path_and_through_the_policy() -> None:
+    actor, lagged, value = numbers(4, 8, seed=1).float(), numbers(4, 8, seed=2).float(), numbers(4, 1, seed=3).float()
+    action, reward = numbers(2, 4, 4, seed=4).float(), numbers(2, 4, seed=5).float()
+    batch, penalty, discount, real = episodes(action, reward, MASK), 2.0, 0.9, int(MASK.sum())
+    given = dataclasses.replace(context(actor, lagged, value, penalty), path_steps=1)
+    residual(batch, ESTIMATORS["pcl"], given).backward()
+    delta = (value.squeeze(-1) - consistent_value(batch, given).detach()) * MASK
+    # ∂ mean ½ δ² / ∂ V(s_t) = mean δ_t - γ δ_{t-1} where there is a step t;  by π: mean λ δ_t ∂ log π(a_t|s_t)
+    by_value = delta.clone()
+    by_value[:, 1:] -= discount * delta[:, :-1] * MASK[:, 1:]
+    torch.testing.assert_close(given.networks["v"].table.grad.squeeze(-1), by_value.sum(0) / real)
+    outputs = actor.clone().requires_grad_()
+    log_policy = log_density(policy_of(outputs), action)
+    (by_policy,) = torch.autograd.grad((penalty * delta * log_policy).sum() / real, outputs)
+    torch.testing.assert_close(given.networks["actor"].table.grad, by_policy)
+    assert float(by_policy.abs().min()) > 1e-4 and given.lagged_networks["actor"].table.grad is None
+
+
+@pytest.mark.parametrize("penalty", [None, 2.0])
+def test_a_step_tunes_the_penalty_by_the_divergence_at_its_real_states_unless_it_is_given(
+    penalty: float | None,
+) -> None:
+    actor, lagged, value = numbers(4, 8, seed=1).float(), numbers(4, 8, seed=2).float(), numbers(4, 1, seed=3).float()
+    batch = episodes(numbers(2, 4, 4, seed=4).float(), numbers(2, 4, seed=5).float(), MASK)
+    first, second = (torch.distributions.Normal(p.mean, p.log_deviation.exp()) for p in map(policy_of, (actor, lagged)))
+    by_step = torch.distributions.kl_divergence(first, second).sum(-1)
+    divergence = float(by_step.expand(2, -1)[MASK].mean())
+    assert divergence > 0.05 and abs(divergence - float(by_step.mean())) > 0.005
+    # Between 0 and twice the bound, where the step is not clipped.
+    given = dataclasses.replace(context(actor, lagged, value, penalty), kl_bound=divergence / 1.3)
+    path_consistency(state_of(given), batch, ESTIMATORS["pcl"], given)
+    expected = 0.25 * math.exp(0.02 * 0.3) if penalty is None else 0.25
+    assert float(given.extra["penalty"]) == pytest.approx(expected, rel=1e-6)
 
 
 def test_on_a_quadratic_reward_it_vanishes_at_the_policy_times_exp_of_reward_over_the_penalty() -> None:
