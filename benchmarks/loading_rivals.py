@@ -134,7 +134,11 @@ def hugging_face_map(pool: ShardPool, folder: Path, batch_size: int, workers: in
 
 
 class _Pairs:
-    """Makes transitions of streamed batches of rows; a batch's last row waits for the next batch."""
+    """Makes transitions of streamed batches of rows; a batch's last row waits for the next batch.
+
+    A row that the next one does not continue is left out: a look at the head of the stream, or an epoch that was broken
+    off, leaves one behind.
+    """
 
     def __init__(self) -> None:
         self.held: dict[str, list[Any]] = {}
@@ -142,9 +146,10 @@ class _Pairs:
     def __call__(self, batch: dict[str, list[Any]]) -> dict[str, list[Any]]:
         batch = {name: [*self.held.get(name, []), *values] for name, values in batch.items()}
         self.held = {name: values[-1:] for name, values in batch.items()}
-        image, terminal = batch["image"], batch["terminal"]
-        following = [image[row if terminal[row] else row + 1] for row in range(len(image) - 1)]
-        return {name: values[:-1] for name, values in batch.items()} | {"next_image": following}
+        image, terminal, step = batch["image"], batch["terminal"], batch["step"]
+        rows = [row for row in range(len(image) - 1) if terminal[row] or step[row + 1] == step[row] + 1]
+        following = [image[row if terminal[row] else row + 1] for row in rows]
+        return {name: [values[row] for row in rows] for name, values in batch.items()} | {"next_image": following}
 
 
 def hugging_face_stream(pool: ShardPool, batch_size: int, workers: int) -> Epoch:

@@ -2,11 +2,11 @@
 
     python benchmarks/training.py --shards data/regular-10k
 
-All take turns in one process, on batches of the same data that lie ready in memory. Ours is `Session.update` with
-default options: augmentation, target, forward, backward, optimiser, averaged weights. The plain rival
-(`plain_pytorch.py`) does all of that too, in float32; at each start its pictures must equal ours, and its Q and target
-to 1e-4. Its `dql` runs the whole network on 16 copies of each picture. It profits from the allocator settings of our
-session, which it would not have by itself.
+Ours and its rival take turns in one process, on batches of the same data that lie ready in memory. Ours is
+`Session.update` with default options: augmentation, target, forward, backward, optimiser, averaged weights. The plain
+rival (`plain_pytorch.py`) does all of that too, in float32; at each start its pictures must equal ours, and its Q and
+target to 1e-4. Its `dql` runs the whole network on 16 copies of each picture. It profits from the allocator settings of
+our session, which it would not have by itself.
 
 d3rlpy's DDPG (`d3rlpy_rival.py`, which says what it needs) learns from the same pictures with its own default network
 and settings, without augmentation: another and smaller job than ours. Where it is not installed that row is left out.
@@ -206,23 +206,19 @@ def main(
     """Measure transitions a second of training, and where a step's time goes."""
     pool = open_shards(shards)
     kept, held_back = pool.split(0.05, 0)
-    runs: dict[str, tuple[Callable[[], None], int]] = {}
-    sessions: dict[str, tuple[Session, list[Batch]]] = {}
+    rows, pieces, precision = [], [], {}
     random.seed(0)
     torch.manual_seed(0)
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder:
+        # One estimator after the other: a turn of ours and one of its rival then lie within seconds of each other.
         for name in dict.fromkeys(algos):
             settings = default_settings(name, shards, Path(folder) / name, threads)
-            current = stack.enter_context(session(settings, pool, kept, held_back))
-            sessions[name] = current, ready(current, kept, steps)
-            runs |= rivals_of(*sessions[name])
-        rows = speed_rows(runs, turns)
-        pieces = [
-            measure_pieces(current, batches, turns).row(name)
-            for name, (current, batches) in sessions.items()
-            if name != "ddpg"
-        ]
-    precision = {name: current.precision.name for name, (current, _) in sessions.items()}
+            with session(settings, pool, kept, held_back) as current:
+                batches = ready(current, kept, steps)
+                rows += speed_rows(rivals_of(current, batches), turns)
+                if name != "ddpg":
+                    pieces.append(measure_pieces(current, batches, turns).row(name))
+                precision[name] = current.precision.name
     facts = {"steps a turn": steps, "turns": turns, "threads": torch.get_num_threads(), "our precision": precision}
     if pieces:
         facts["where a step of ours goes, medians"] = pieces

@@ -9,7 +9,6 @@ from graspq.datasets.batch import (
     RECORD,
     EpisodeBatch,
     Int64,
-    Records,
     TransitionBatch,
     episode_batch,
     transition_batch,
@@ -24,24 +23,14 @@ def gather_transitions(blocks: Blocks, owners: Int64, rows: Int64, need_next: bo
     shape = blocks[int(owners[0])].images.shape[1:]
     image = np.empty((len(rows), *shape), np.uint8)
     next_image = np.empty_like(image) if need_next else None
-    records = _records(blocks, owners, rows)
-    after = rows + ~records["terminal"]
-    for index, (owner, row, following) in enumerate(zip(owners.tolist(), rows.tolist(), after.tolist(), strict=True)):
-        images = blocks[owner].images
-        image[index] = images[row]
-        if next_image is not None:
-            next_image[index] = images[following]
-    return transition_batch(image, next_image, records)
-
-
-def _records(blocks: Blocks, owners: Int64, rows: Int64) -> Records:
-    """Return RECORD [B], block by block: one by one, records cost as much as images."""
     records = np.empty(len(rows), RECORD)
-    order = np.argsort(owners, kind="stable")
-    borders = np.flatnonzero(np.diff(owners[order])) + 1
-    for group in np.split(order, borders):
-        records[group] = blocks[int(owners[group[0]])].records[rows[group]]
-    return records
+    for index, (owner, row) in enumerate(zip(owners.tolist(), rows.tolist(), strict=True)):
+        block = blocks[owner]
+        image[index] = block.images[row]
+        records[index] = record = block.records[row]
+        if next_image is not None:
+            next_image[index] = block.images[row + (not record["terminal"])]
+    return transition_batch(image, next_image, records)
 
 
 def gather_episodes(blocks: Blocks, owners: Int64, numbers: Int64, max_steps: int) -> EpisodeBatch:

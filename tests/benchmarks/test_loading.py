@@ -4,7 +4,7 @@ import click
 import pytest
 import torch
 from loading import check, consume, known
-from loading_rivals import Table, hugging_face_map, hugging_face_stream, lerobot_style, png_files
+from loading_rivals import Table, _Pairs, hugging_face_map, hugging_face_stream, lerobot_style, png_files
 from streaming import larger
 
 from graspq.datasets.blocks import row_bytes
@@ -59,3 +59,19 @@ def test_a_small_pool_is_named_so_often_that_a_tenth_of_it_is_enough(pool):
     assert buffer_bytes == wide.rows // 10 * row_bytes(pool.image_shape)
     # Two windows of 64 blocks are the least that the sampler takes.
     assert len(wide.blocks) // 10 >= 2 * 64
+
+
+def rows(*numbers):
+    """Return rows of a stream of episodes of three steps."""
+    return {"image": list(numbers), "step": [n % 3 for n in numbers], "terminal": [n % 3 == 2 for n in numbers]}
+
+
+def test_streamed_rows_become_transitions_across_batches_and_what_a_row_does_not_continue_is_left_out():
+    pairs = _Pairs()
+    made = [pairs(rows(*range(4))), pairs(rows(*range(4, 9)))]
+    found = [pair for one in made for pair in zip(one["image"], one["next_image"], strict=True)]
+    assert found == [(n, n if n % 3 == 2 else n + 1) for n in range(8)]
+    # The stream begins anew: row 8, held back, ends an episode; then row 1, held back, is not continued by row 0.
+    again, broken = pairs(rows(0, 1)), pairs(rows(0, 1, 2))
+    assert [again["image"], again["next_image"]] == [[8, 0], [8, 1]]
+    assert [broken["image"], broken["next_image"]] == [[0, 1], [1, 2]]
