@@ -167,7 +167,7 @@ def main(
         "run": run.as_posix(),
         "workers of each": settings.workers,
         "our environments": environments,
-        "threads of our decisions": torch.get_num_threads(),
+        "threads of our decisions": 1,
         "threads of each rival's process": max(1, available_cores() // (settings.workers or 1)),
         "turns": turns,
     }

@@ -5,26 +5,19 @@ Dimension key: B batch, T steps, H W C image.
 
 import numpy as np
 
-from graspq.datasets.batch import (
-    RECORD,
-    EpisodeBatch,
-    Int64,
-    TransitionBatch,
-    episode_batch,
-    transition_batch,
-)
+from graspq.datasets.batch import RECORD, EpisodeBatch, Int64, TransitionBatch, episode_batch, transition_batch
 from graspq.datasets.blocks import BlockArrays
 
 Blocks = dict[int, BlockArrays]
 
 
-def gather_transitions(blocks: Blocks, owners: Int64, rows: Int64, need_next: bool) -> TransitionBatch:
-    """Return the batch of row `rows[i]` of block `owners[i]`, for all i; both int64 [B]."""
-    shape = blocks[int(owners[0])].images.shape[1:]
+def gather_transitions(blocks: Blocks, owners: list[int], rows: list[int], need_next: bool) -> TransitionBatch:
+    """Return the batch of row `rows[i]` of block `owners[i]`, for all i."""
+    shape = blocks[owners[0]].images.shape[1:]
     image = np.empty((len(rows), *shape), np.uint8)
     next_image = np.empty_like(image) if need_next else None
     records = np.empty(len(rows), RECORD)
-    for index, (owner, row) in enumerate(zip(owners.tolist(), rows.tolist(), strict=True)):
+    for index, (owner, row) in enumerate(zip(owners, rows, strict=True)):
         block = blocks[owner]
         image[index] = block.images[row]
         records[index] = record = block.records[row]
@@ -33,17 +26,17 @@ def gather_transitions(blocks: Blocks, owners: Int64, rows: Int64, need_next: bo
     return transition_batch(image, next_image, records)
 
 
-def gather_episodes(blocks: Blocks, owners: Int64, numbers: Int64, max_steps: int) -> EpisodeBatch:
+def gather_episodes(blocks: Blocks, owners: list[int], numbers: list[int], max_steps: int) -> EpisodeBatch:
     """Return the batch of episode `numbers[i]` of block `owners[i]`, for all i, padded to `max_steps`.
 
     Raises:
         ValueError: an episode is longer.
     """
-    shape = blocks[int(owners[0])].images.shape[1:]
+    shape = blocks[owners[0]].images.shape[1:]
     image = np.zeros((len(numbers), max_steps, *shape), np.uint8)
     records = np.zeros((len(numbers), max_steps), RECORD)
     mask = np.zeros((len(numbers), max_steps), np.bool_)
-    for index, (owner, number) in enumerate(zip(owners.tolist(), numbers.tolist(), strict=True)):
+    for index, (owner, number) in enumerate(zip(owners, numbers, strict=True)):
         block = blocks[owner]
         first, length = int(block.first_rows[number]), int(block.lengths[number])
         if length > max_steps:
@@ -54,7 +47,7 @@ def gather_episodes(blocks: Blocks, owners: Int64, numbers: Int64, max_steps: in
     return episode_batch(image, records, mask)
 
 
-def located(offsets: Int64, items: Int64) -> tuple[Int64, Int64]:
+def located(offsets: Int64, items: Int64) -> tuple[list[int], list[int]]:
     """Return, for each item, its block and its number within that block; `offsets` is the first item of each block."""
-    owners: Int64 = np.searchsorted(offsets, items, side="right") - 1
-    return owners, items - offsets[owners]
+    owners = np.searchsorted(offsets, items, side="right") - 1
+    return owners.tolist(), (items - offsets[owners]).tolist()

@@ -55,6 +55,11 @@ class _Buffer:
             self.bytes += block.bytes
             self.peak_bytes = max(self.peak_bytes, self.bytes)
 
+    def read(self, wanted: Int64) -> None:
+        """Wait until all of these blocks are here."""
+        self.ask(self.missing(wanted))
+        self.receive()
+
     def keep(self, wanted: set[int]) -> None:
         """Forget all blocks but these."""
         for index in self.blocks.keys() - wanted:
@@ -156,8 +161,7 @@ class _Loader(Generic[B]):
                 needed = np.concatenate([windows[window] for window in touched])
                 self._buffer.receive()
                 self._buffer.keep({*needed.tolist(), *following.tolist()})
-                self._buffer.ask(self._buffer.missing(needed))
-                self._buffer.receive()
+                self._buffer.read(needed)
                 resident = epoch, touched
             yield self._gather(self.sampler.indices(epoch, step))
             if len(touched) == 1 and self.sampler.windows_per_epoch > 1:
@@ -179,7 +183,7 @@ class _Loader(Generic[B]):
         steps_left = max(1, items_left // self.sampler.batch_size)
         self._buffer.ask(missing[: -(-len(missing) // steps_left)])
 
-    def _located(self, items: Int64) -> tuple[Int64, Int64]:
+    def _located(self, items: Int64) -> tuple[list[int], list[int]]:
         """Return the block, as its index in the pool, and the number within the block of each item."""
         return located(self.sampler.item_offsets, items)
 
@@ -271,14 +275,12 @@ def episode_batches(pool: ShardPool, batch_size: int, max_steps: int | None = No
 
 
 def _in_order(
-    pool: ShardPool, counts: list[int], batch_size: int, gather: Callable[[Blocks, Int64, Int64], B]
+    pool: ShardPool, counts: list[int], batch_size: int, gather: Callable[[Blocks, list[int], list[int]], B]
 ) -> Iterator[B]:
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     with contextlib.closing(_Buffer(pool)) as buffer:
         for start in range(0, int(offsets[-1]), batch_size):
             owners, numbers = located(offsets, np.arange(start, min(start + batch_size, int(offsets[-1]))))
-            needed = np.unique(owners)
-            buffer.keep(set(needed.tolist()))
-            buffer.ask(buffer.missing(needed))
-            buffer.receive()
+            buffer.keep(set(owners))
+            buffer.read(np.unique(owners))
             yield gather(buffer.blocks, owners, numbers)

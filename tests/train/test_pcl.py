@@ -234,14 +234,8 @@ def test_evenly_spread_states_give_the_statistics_that_both_policies_use(states:
     networks = [Normalised() for _ in range(2)]
     networks[1].load_state_dict(networks[0].state_dict())
     networks[1].eval()
-    value = torch.zeros(states, 1)
-    given = plain_context(
-        {"actor": networks[0], "v": Outputs(value)},
-        {"actor": networks[1], "v": Outputs(value)},
-        loss="cross-entropy",
-        extra={"penalty": torch.tensor(0.25)},
-        penalty=None,
-    )
+    given = context(torch.zeros(1, 8), torch.zeros(1, 8), torch.zeros(states, 1), None)
+    given.networks["actor"], given.lagged_networks["actor"] = networks
     state = state_of(given)
     path_consistency(state, episodes(torch.zeros(1, states, 4), torch.zeros(1, states)), ESTIMATORS["pcl"], given)
     for network in networks:
