@@ -4,11 +4,12 @@
 
 Each part is a script of this folder in a process of its own, which runs its rivals itself. What a part measured is kept
 in `--work`: the same command goes on where it was stopped, and `--again PART` measures one anew. Nothing else should
-run meanwhile; it takes about an hour on 2 cores.
+run meanwhile; it takes about two hours on 2 cores. Every part says on which day and with which code it was measured.
 """
 
 import dataclasses
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +22,6 @@ from graspq.common.errors import UserError
 from graspq.common.files import read_json, write_json, write_text
 from graspq.common.machine import available_cores
 from graspq.common.options import Command
-from graspq.common.provenance import code_revision, versions
 
 FOLDER = Path(__file__).resolve().parent
 BEGIN, END = "<!-- made by benchmarks/bench.py -->", "<!-- end -->"
@@ -33,7 +33,7 @@ class Part:
 
     Attributes:
         script: its name without `.py`.
-        arguments: `{shards}`, `{run}` and `{work}` stand for the options of this command.
+        arguments: `{shards}` and `{run}` stand for the options of this command, `{own}` for a folder of the part.
     """
 
     script: str
@@ -51,8 +51,8 @@ PARTS = {
     "training": Part("training", ("--shards", "{shards}")),
     "estimators": Part("estimators", ("--shards", "{shards}")),
     "decision": Part("decision"),
-    "evaluation": Part("evaluation", ("{run}", "--episodes", "512", "--rival-episodes", "64")),
-    "time_to_quality": Part("time_to_quality", ("--shards", "{shards}", "--work", "{work}/time_to_quality")),
+    "evaluation": Part("evaluation", ("{run}", "--episodes", "512", "--rival-episodes", "128")),
+    "time_to_quality": Part("time_to_quality", ("--shards", "{shards}", "--seeds", "3", "--work", "{own}")),
 }
 
 
@@ -77,6 +77,8 @@ def measured(name: str, words: list[str], work: Path, again: bool) -> Found:
     """
     path = work / f"{name}.json"
     if again or not path.exists():
+        if again:
+            shutil.rmtree(work / name, ignore_errors=True)  # what it went on from
         click.echo(f"\n== {name}: python {' '.join(words)}", err=True)
         fresh = work / f"{name}.fresh.json"
         done = subprocess.run(
@@ -130,21 +132,19 @@ def main(
     found: dict[str, Found] = {}
     commands: dict[str, str] = {}
     for name, part in PARTS.items():
-        words = part.words(shards=shards, run=run, work=str(work))
+        words = part.words(shards=shards, run=run, own=(work / name).as_posix())
         commands[name] = f"python {' '.join(words)}"
         if name in parts or name in again or not parts:
             found[name] = measured(name, words, work, name in again)
         elif (work / f"{name}.json").exists():
             found[name] = measured(name, words, work, False)
     lines = table(ratio_rows(found, commands))
-    facts = {
-        "processor": processor(),
-        "cores": available_cores(),
-        "versions": versions("torch", "pybullet", "numpy", "pyarrow", "datasets"),
-        "code_revision": code_revision(),
-    }
+    facts = {"processor": processor(), "cores": available_cores()}
     write_json(out, {**facts, "commands": commands, "parts": found})
-    where = f"{facts['processor']}, {facts['cores']} cores; every figure: [{out}]({out})."
+    where = (
+        f"{facts['processor']}, {facts['cores']} cores. Every figure, with the day and the code of each part: "
+        f"[{out}]({out})."
+    )
     write_text(page, with_section(page.read_text(), f"{lines}\n\n{where}"))
     click.echo(lines)
 

@@ -147,7 +147,8 @@ def memory(objects: Path, seed: int, scenes: int) -> tuple[Rows, dict[str, Any]]
     rows = [{"bins filled": int(counts[index]), "resident MB": sizes[index] / 1e6} for index in _spread(len(counts))]
     return rows, {
         "growth, kB a bin (second half)": slope / 1e3,
-        f"growth in a worker's life of {pool.BLOCKS_PER_WORKER} bins, MB": slope * pool.BLOCKS_PER_WORKER / 1e6,
+        "bins in a worker's life": pool.BLOCKS_PER_WORKER,
+        "growth in a worker's life, MB": slope * pool.BLOCKS_PER_WORKER / 1e6,
         f"processes for 6 blocks with 1 worker renewed after {RENEWED_AFTER}": processes_seen(objects, seed, blocks=6),
     }
 

@@ -2,11 +2,12 @@
 
     python benchmarks/loading.py --shards data/regular-10k
 
-What is timed is an epoch from the making of the loader on, the start of worker processes included; of the slow rivals
-the first batches of an epoch. Every sample of a rival's first batch is looked up in the data. Pages are in the system's
-cache for all. Ours runs one background thread; "streaming" reads every block from disk in every epoch, through a buffer
-that holds a tenth of the data, as with data larger than memory. The sampler mixes at least 64 blocks in a window, so a
-small dataset is named as many times over as it takes for a tenth of it to be enough; its files are read anew each time.
+What is timed is a whole epoch from the making of the loader on, the start of worker processes included. Every sample
+of a rival's first batch is looked up in the data. Pages are in the system's cache for all. Ours runs in one process: a
+thread gathers batches, and as many threads as there are cores, four at most, read blocks. "Streaming" reads every block
+from disk in every epoch, through a buffer that holds a tenth of the data, as with data larger than memory. The sampler
+mixes at least 64 blocks in a window, so a small dataset is named as many times over as it takes for a tenth of it to be
+enough; its files are read anew each time.
 
 Rivals (`loading_rivals.py`) run with `--workers` processes and make copies of the data in `--scratch`, untimed. All but
 the first need Hugging Face `datasets` (in the `dev` extra): without it they are left out.
@@ -97,12 +98,10 @@ def rival_runs(pool: ShardPool, folder: Path, batch_size: int, batches: int, wor
     """Make the rivals and return, for each, what runs and how many samples it takes."""
     data = rivals.Table(pool)
     transitions, size = known(data), (batch_size, workers)
-    epoch_batches = pool.rows // batch_size
     makers: dict[str, tuple[Callable[[], rivals.Epoch], int]] = {
         PNG: (lambda: rivals.png_files(data, folder / "png", *size), batches),
         "Hugging Face datasets, map-style": (lambda: rivals.hugging_face_map(pool, folder / "arrow", *size), batches),
-        # Whole epochs: it fills a shuffle buffer first.
-        "Hugging Face datasets, streaming": (lambda: rivals.hugging_face_stream(pool, *size), epoch_batches),
+        "Hugging Face datasets, streaming": (lambda: rivals.hugging_face_stream(pool, *size), batches),
         "LeRobot-style random access": (lambda: rivals.lerobot_style(data, folder / "lerobot", *size), batches),
     }
     runs: dict[str, Run] = {}
@@ -168,9 +167,9 @@ def scratch_folder(given: Path | None) -> Iterator[Path]:
 @click.option("--batch-size", type=click.IntRange(2), default=256, show_default=True, help="Transitions of a batch.")
 @click.option("--workers", type=click.IntRange(0), default=2, show_default=True, help="Worker processes of each rival.")
 @click.option("--turns", type=click.IntRange(1), default=5, show_default=True, help="Turns that are measured.")
-@click.option("--rival-batches", type=click.IntRange(1), default=40, show_default=True, help="Batches of slow rivals.")
+@click.option("--rival-batches", type=click.IntRange(1), default=None, help="The rivals'; an epoch if not given.")
 @click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Training steps in a turn.")
-@click.option("--memory-batches", type=click.IntRange(8), default=3000, show_default=True, help="Of the memory test.")
+@click.option("--memory-steps", type=click.IntRange(8), default=1200, show_default=True, help="Of the memory test.")
 @click.option("--threads", type=click.IntRange(1), default=None, help="CPU threads; torch's own choice if not given.")
 @click.option(
     "--part",
@@ -188,9 +187,9 @@ def main(
     batch_size: int,
     workers: int,
     turns: int,
-    rival_batches: int,
+    rival_batches: int | None,
     steps: int,
-    memory_batches: int,
+    memory_steps: int,
     threads: int | None,
     parts: tuple[str, ...],
     scratch: Path | None,
@@ -203,12 +202,12 @@ def main(
     if "speed" in parts:
         with scratch_folder(scratch) as folder:
             runs, facts["streaming buffer, bytes"] = our_runs(shards, pool, batch_size)
-            runs |= rival_runs(pool, folder, batch_size, rival_batches, workers)
+            runs |= rival_runs(pool, folder, batch_size, rival_batches or pool.rows // batch_size, workers)
             found["Loading shuffled transitions with s' from disk"] = speed_rows(runs, turns)
     if "waiting" in parts:
         found["waiting for data in training"] = list(waiting_rows(shards, pool, steps, turns, threads))
     if "memory" in parts:
-        found["resident memory of streaming"] = [memory_row(shards, batch_size, memory_batches)]
+        found["resident memory of streaming"] = [memory_row(shards, memory_steps, threads)]
     title = next(iter(found))
     report(title, found.pop(title), facts | found, out)
 

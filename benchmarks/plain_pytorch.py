@@ -1,7 +1,8 @@
 """The default network and its training step as one writes them plainly in PyTorch: the rival of `training.py`.
 
-float32, images in NCHW, no compilation, no fused optimiser, one image after the other in augmentation, and a candidate
-action judged by the whole network. It computes what `graspq.train` computes, and `training.py` checks that at each run.
+float32, images in NCHW, no compilation, no fused optimiser, one image after the other in augmentation. Candidate
+actions share their picture's part of Q, or have a copy of it each (`tiled`). It computes what `graspq.train` computes,
+and `training.py` checks that at each run.
 Dimensions: B batch, N candidates, A action, H W C image.
 """
 
@@ -63,6 +64,10 @@ class PlainNetwork(nn.Module):
             step: int64 [B].
             action: float32 [B, A].
         """
+        return self.of_actions(self.trunk(image, step), action.unsqueeze(1)).squeeze(1)
+
+    def trunk(self, image: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what no action changes: state [B, 256], key points [B, 32], local map [B, 32, 16, 16]."""
         x = (image - 128) / 64
         x = F.relu(self.stem(x))
         x = F.relu(self.reduce(x))
@@ -75,11 +80,19 @@ class PlainNetwork(nn.Module):
         flat = F.relu(self.squeeze(coarse)).flatten(1)
         state = F.relu(self.state(flat) + self.points_to_state(points) + self.step_to_state(done))
         local = F.relu(self.map_fine(fine) + F.interpolate(self.map_coarse(coarse), scale_factor=2, mode="nearest"))
-        places = (self.where(points) + self.displacement(action)).clamp(-1.1, 1.1).view(-1, 1, 4, 2)
-        looks = F.grid_sample(local, places, padding_mode="border", align_corners=True)  # [B, 32, 1, 4]
-        looks = looks.squeeze(2).permute(0, 2, 1).flatten(1)
-        hidden = F.relu(self.state_to_hidden(state) + self.action_to_hidden(action) + self.looks_to_hidden(looks))
-        return self.last(F.relu(self.hidden(hidden))).squeeze(1)
+        return state, points, local
+
+    def of_actions(self, trunk: tuple[Tensor, Tensor, Tensor], action: Tensor) -> Tensor:
+        """Return Q before its logistic function of the actions [B, N, A]; float32 [B, N]."""
+        state, points, local = trunk
+        rows, count = action.shape[:2]
+        places = (self.where(points).unsqueeze(1) + self.displacement(action)).clamp(-1.1, 1.1)
+        places = places.view(rows, count, 4, 2)
+        looks = F.grid_sample(local, places, padding_mode="border", align_corners=True)  # [B, 32, N, 4]
+        looks = looks.permute(0, 2, 3, 1).flatten(2)
+        state = self.state_to_hidden(state).unsqueeze(1)
+        hidden = F.relu(state + self.action_to_hidden(action) + self.looks_to_hidden(looks))
+        return self.last(F.relu(self.hidden(hidden))).squeeze(2)
 
     def keypoints(self, x: Tensor) -> Tensor:
         """Return the expected place, x then y in [-1, 1], of each of 16 heat maps; float32 [B, 32]."""
@@ -162,7 +175,7 @@ class PlainTraining:
         others = [parameter for parameter in network.parameters() if parameter.dim() <= 1]
         groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=settings.learning_rate, foreach=False, fused=False)
-        self.step = 0
+        self.step, self.tiled = 0, False
 
     def update(self, batch: dict[str, Tensor]) -> Tensor:
         """Take one gradient step; return the loss."""
@@ -185,12 +198,15 @@ class PlainTraining:
 
     @torch.no_grad()
     def double_q(self, batch: dict[str, Tensor], next_image: Tensor, candidates: Tensor) -> Tensor:
-        """Return r + γ Q'(s', argmax Q(s', aᵢ)), every one of the N candidates with a copy of its picture."""
+        """Return r + γ Q'(s', argmax Q(s', aᵢ)) of N candidates; where `tiled`, each with a copy of its picture."""
         self.network.eval()
         rows, count, dimensions = candidates.shape
-        copies = next_image.repeat_interleave(count, 0)
-        steps = batch["next_step"].repeat_interleave(count)
-        q = self.network(copies, steps, candidates.view(-1, dimensions)).view(rows, count)
+        if self.tiled:
+            copies = next_image.repeat_interleave(count, 0)
+            steps = batch["next_step"].repeat_interleave(count)
+            q = self.network(copies, steps, candidates.view(-1, dimensions)).view(rows, count)
+        else:
+            q = self.network.of_actions(self.network.trunk(next_image, batch["next_step"]), candidates)
         best = candidates[torch.arange(rows), q.argmax(1)]
         value = torch.sigmoid(self.target_network(next_image, batch["next_step"], best))
         return batch["reward"] + self.discount * value * (~batch["terminal"]).float()

@@ -22,12 +22,9 @@ from timing import median_ratio
 from graspq.common.errors import UserError
 from graspq.datasets.blocks import row_bytes
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.loader import TransitionLoader
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
-from graspq.train.batch import to_tensors
 from graspq.train.batches import training_batches
-from graspq.train.hardware import keep_freed_memory
 from graspq.train.loop import Session, session
 
 TIMES = 10
@@ -92,24 +89,27 @@ def waiting_rows(
                 yield waiting_row(current, wide, steps, turns)
 
 
-def _memory_of_a_loader(shards: tuple[str, ...], batch_size: int, batches: int) -> dict[str, Any]:
-    keep_freed_memory()
-    pool, buffer_bytes = larger(open_shards(shards), batch_size)
+def _memory_of_training(shards: tuple[str, ...], steps: int, threads: int | None) -> dict[str, Any]:
+    kept, held_back = (pool := open_shards(shards)).split(0.05, 0)
     start, seen = resident_bytes() / 2**20, []
-    with TransitionLoader(pool, batch_size, 0, buffer_bytes) as loader:
-        for index in range(batches):
-            to_tensors(next(loader), CPU)
-            if index % max(1, batches // 200) == 0:
-                seen.append(resident_bytes() / 2**20)
-        taken = loader.peak_bytes
+    with tempfile.TemporaryDirectory() as folder:
+        settings = default_settings("mc", shards, Path(folder) / "mc", threads)
+        wide, buffer_bytes = larger(kept, settings.batch_size)
+        settings = replace(settings, buffer_bytes=buffer_bytes)
+        with session(settings, pool, kept, held_back) as current:
+            wide = wide.with_discount(current.discount)
+            with training_batches(wide, settings, current.estimator, CPU, 0) as batches:
+                for batch in itertools.islice(batches, steps):
+                    current.update(batch)
+                    seen.append(resident_bytes() / 2**20)
     quarter = max(1, len(seen) // 4)
     early, late = statistics.mean(seen[quarter : 2 * quarter]), statistics.mean(seen[-quarter:])
     return {
-        "batches": batches,
-        "data over buffer": pool.rows * row_bytes(pool.image_shape) / buffer_bytes,
-        "epochs": batches * batch_size / pool.rows,
+        "training": "mc",
+        "steps": steps,
+        "data over buffer": wide.rows * row_bytes(pool.image_shape) / buffer_bytes,
+        "epochs": steps * settings.batch_size / wide.rows,
         "buffer, MiB": buffer_bytes / 2**20,
-        "blocks at most, MiB": taken / 2**20,
         "before, MiB": start,
         "second quarter, MiB": early,
         "last quarter, MiB": late,
@@ -118,8 +118,8 @@ def _memory_of_a_loader(shards: tuple[str, ...], batch_size: int, batches: int) 
     }
 
 
-def memory_row(shards: tuple[str, ...], batch_size: int, batches: int) -> dict[str, Any]:
-    """Return the resident memory of a streaming loader in a process of its own."""
+def memory_row(shards: tuple[str, ...], steps: int, threads: int | None) -> dict[str, Any]:
+    """Return the resident memory of streaming training in a process of its own."""
     with multiprocessing.get_context("spawn").Pool(1) as process:
-        row: dict[str, Any] = process.apply(_memory_of_a_loader, (shards, batch_size, batches))
+        row: dict[str, Any] = process.apply(_memory_of_training, (shards, steps, threads))
         return row

@@ -5,8 +5,9 @@
 Ours and its rival take turns in one process, on batches of the same data that lie ready in memory. Ours is
 `Session.update` with default options: augmentation, target, forward, backward, optimiser, averaged weights. The plain
 rival (`plain_pytorch.py`) does all of that too, in float32; at each start its pictures must equal ours, and its Q and
-target to 1e-4. Its `dql` runs the whole network on 16 copies of each picture. It profits from the allocator settings of
-our session, which it would not have by itself.
+target to 1e-4. It profits from the allocator settings of our session, which it would not have by itself. Its `dql`
+computes the picture's part of Q once for all 16 candidates, as ours does; a second one, which runs the whole network on
+16 copies of each picture, stands beside it.
 
 d3rlpy's DDPG (`d3rlpy_rival.py`, which says what it needs) learns from the same pictures with its own default network
 and settings, without augmentation: another and smaller job than ours. Where it is not installed that row is left out.
@@ -43,8 +44,10 @@ from graspq.train.updates import loss_of, target_of
 
 ALGOS = ("mc", "dql", "ddpg")
 TOLERANCE = 1e-4
+RIVALS = ("plain PyTorch", "d3rlpy")
+TILED = "plain PyTorch, 16 tiled copies"
 PIECES = ("augmentation", "target", "forward", "backward", "optimiser", "averages")
-NETWORK = ("target", "forward", "backward")
+NETWORK = ("forward", "backward")
 
 
 def plain_batch(batch: Batch) -> dict[str, Tensor]:
@@ -90,7 +93,10 @@ def greatest_difference(current: Session, plain: PlainTraining, batch: Batch) ->
         current.state.learned["q"].eval()
         candidates = uniform_actions(torch.Generator().manual_seed(2), rows, settings.candidates)
         target = current.estimator.target(batch, context).squeeze(1)
-        differences.append(target - plain.double_q(theirs, theirs["next_image"].float(), candidates))
+        for tiled in (False, True):
+            plain.tiled = tiled
+            differences.append(target - plain.double_q(theirs, theirs["next_image"].float(), candidates))
+        plain.tiled = False
     return max(float(difference.abs().max()) for difference in differences)
 
 
@@ -121,11 +127,15 @@ class Pieces:
         self.seconds.setdefault(piece, []).append(time.perf_counter() - start)
 
     def row(self, name: str) -> dict[str, Any]:
-        """Return the medians in milliseconds, and the network's share of the sum of the pieces."""
+        """Return the medians in milliseconds, and what share of a whole step the network takes."""
         median = {piece: 1e3 * statistics.median(self.seconds[piece]) for piece in ("step", *PIECES)}
-        share = sum(median[piece] for piece in NETWORK) / sum(median[piece] for piece in PIECES)
-        shown = {f"{piece}, ms": value for piece, value in median.items()}
-        return {"estimator": name, **shown, "share of target, forward and backward": share}
+        network = sum(median[piece] for piece in NETWORK)
+        return {
+            "estimator": name,
+            **{f"{piece}, ms": value for piece, value in median.items()},
+            "share of forward and backward": network / median["step"],
+            "share of forward, backward and target": (network + median["target"]) / median["step"],
+        }
 
 
 def measure_pieces(current: Session, batches: list[Batch], turns: int) -> Pieces:
@@ -165,9 +175,14 @@ def rivals_of(current: Session, batches: list[Batch]) -> dict[str, tuple[Callabl
         return found | ({} if run is None else {"ddpg, d3rlpy": (run, size * len(batches))})
     plain = plain_training(current)
     check_agreement(current, plain, batches[0])
-    # Sixteen copies of every picture take seconds.
-    theirs = [plain_batch(batch) for batch in (batches[:1] if plain.bootstrapped else batches)]
-    return found | {f"{algo}, plain PyTorch": (steps_on(theirs, plain.update), size * len(theirs))}
+    theirs = [plain_batch(batch) for batch in batches]
+    found[f"{algo}, plain PyTorch"] = steps_on(theirs, plain.update), size * len(theirs)
+    if plain.bootstrapped:
+        tiled = plain_training(current)
+        tiled.tiled = True
+        # Sixteen copies of every picture take seconds.
+        found[f"{algo}, {TILED}"] = steps_on(theirs[:1], tiled.update), size
+    return found
 
 
 def speed_rows(runs: dict[str, tuple[Callable[[], None], int]], turns: int) -> list[dict[str, Any]]:
@@ -176,10 +191,17 @@ def speed_rows(runs: dict[str, tuple[Callable[[], None], int]], turns: int) -> l
     pace = {name: [value / runs[name][1] for value in values] for name, values in seconds.items()}
     rows = []
     for name, values in pace.items():
-        algo = name.partition(",")[0]
-        rival = next((other for other in pace if other != name and other.startswith(f"{algo},")), None)
-        ratio = median_ratio(pace[rival], values) if rival is not None and name.endswith("graspq") else None
-        rows.append({"training": name, "transitions a second": 1 / statistics.median(values), "times its rival": ratio})
+        algo, _, who = name.partition(", ")
+        others = {kind: pace.get(f"{algo}, {kind}") for kind in (*RIVALS, TILED)} if who == "graspq" else {}
+        ratios = {kind: median_ratio(other, values) for kind, other in others.items() if other is not None}
+        rows.append(
+            {
+                "training": name,
+                "transitions a second": 1 / statistics.median(values),
+                "times its rival": next((ratios[kind] for kind in RIVALS if kind in ratios), None),
+                "times tiled copies": ratios.get(TILED),
+            }
+        )
     return rows
 
 

@@ -3,10 +3,14 @@
 Dimension key: B batch, T steps, H W C image.
 """
 
+import math
+
 import numpy as np
+import pyarrow as pa
 
 from graspq.datasets.batch import RECORD, EpisodeBatch, Int64, TransitionBatch, episode_batch, transition_batch
 from graspq.datasets.blocks import BlockArrays
+from graspq.datasets.episode import UInt8
 
 Blocks = dict[int, BlockArrays]
 
@@ -14,8 +18,8 @@ Blocks = dict[int, BlockArrays]
 def gather_transitions(blocks: Blocks, owners: list[int], rows: list[int], need_next: bool) -> TransitionBatch:
     """Return the batch of row `rows[i]` of block `owners[i]`, for all i."""
     shape = blocks[owners[0]].images.shape[1:]
-    image = np.empty((len(rows), *shape), np.uint8)
-    next_image = np.empty_like(image) if need_next else None
+    image = _room((len(rows), *shape))
+    next_image = _room((len(rows), *shape)) if need_next else None
     records = np.empty(len(rows), RECORD)
     for index, (owner, row) in enumerate(zip(owners, rows, strict=True)):
         block = blocks[owner]
@@ -33,7 +37,7 @@ def gather_episodes(blocks: Blocks, owners: list[int], numbers: list[int], max_s
         ValueError: an episode is longer.
     """
     shape = blocks[owners[0]].images.shape[1:]
-    image = np.zeros((len(numbers), max_steps, *shape), np.uint8)
+    image = _room((len(numbers), max_steps, *shape))
     records = np.zeros((len(numbers), max_steps), RECORD)
     mask = np.zeros((len(numbers), max_steps), np.bool_)
     for index, (owner, number) in enumerate(zip(owners, numbers, strict=True)):
@@ -42,6 +46,7 @@ def gather_episodes(blocks: Blocks, owners: list[int], numbers: list[int], max_s
         if length > max_steps:
             raise ValueError(f"max_steps: expected at least {length}, the length of an episode, got {max_steps}")
         image[index, :length] = block.images[first : first + length]
+        image[index, length:] = 0
         records[index, :length] = block.records[first : first + length]
         mask[index, :length] = True
     return episode_batch(image, records, mask)
@@ -51,3 +56,12 @@ def located(offsets: Int64, items: Int64) -> tuple[list[int], list[int]]:
     """Return, for each item, its block and its number within that block; `offsets` is the first item of each block."""
     owners = np.searchsorted(offsets, items, side="right") - 1
     return owners.tolist(), (items - offsets[owners]).tolist()
+
+
+def _room(shape: tuple[int, ...]) -> UInt8:
+    """Return an array to be filled, from Arrow's allocator.
+
+    The C library returns the memory of a batch to the system when it is freed, and the next batch pays for pages anew:
+    that took longer than copying the images. Arrow's keeps it (`datasets/__init__.py` says for how long).
+    """
+    return np.frombuffer(pa.allocate_buffer(math.prod(shape)), np.uint8).reshape(shape)

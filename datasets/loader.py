@@ -46,9 +46,13 @@ class _Buffer:
         for index in indices:
             self._asked[index] = self._readers.submit(self._pool.read_block, self._pool.blocks[index])
 
-    def receive(self) -> None:
-        """Wait for all blocks that were asked for."""
-        for index in list(self._asked):
+    def receive(self, but: int = 0) -> None:
+        """Wait for the blocks that were asked for, but for the last few.
+
+        Raises:
+            UserError: one is damaged.
+        """
+        for index in list(self._asked)[: max(0, len(self._asked) - but)]:
             block = self._asked[index].result()
             self.blocks[index] = block
             del self._asked[index]
@@ -175,13 +179,14 @@ class _Loader(Generic[B]):
     def _read_ahead(self, epoch: int, step: int, window: int, following: Int64) -> None:
         """Ask for so much of the next window that it is there in time, spread evenly over the steps that are left.
 
-        It is read while the next batch is gathered, and received after it.
+        Readers may be one batch behind: neither they nor the gathering wait for the other at every batch.
         """
-        self._buffer.receive()
         missing = self._buffer.missing(following)
         items_left = int(self.sampler.window_borders(epoch)[window + 1]) - (step + 1) * self.sampler.batch_size
         steps_left = max(1, items_left // self.sampler.batch_size)
-        self._buffer.ask(missing[: -(-len(missing) // steps_left)])
+        now = -(-len(missing) // steps_left)
+        self._buffer.receive(but=now)
+        self._buffer.ask(missing[:now])
 
     def _located(self, items: Int64) -> tuple[list[int], list[int]]:
         """Return the block, as its index in the pool, and the number within the block of each item."""
