@@ -47,7 +47,7 @@ quickstart: setup ## the whole job, small: objects, 2,000 grasps, mc and dql, sc
 	$(BIN)/grasp-report $(QUICK) --out $(QUICK)/report.html
 	@echo "open $(QUICK)/report.html"
 
-bench: setup ## every published ratio: results/bench.json and the table in RESULTS.md (about an hour; goes on where it was stopped)
+bench: setup ## every published ratio: results/bench.json and the table in RESULTS.md (about two hours; goes on where it was stopped)
 	$(if $(wildcard data/regular-10k/manifest.json),,$(BIN)/grasp-datagen --size 10k --out data/regular-10k)
 	$(if $(wildcard runs/mc-regular-10k-seed0/config.json),,$(BIN)/grasp-train --algo mc --shards data/regular-10k)
 	$(BIN)/python benchmarks/bench.py $(BENCH)

@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import click
+from breakdown import section
 from ratios import Found, ratio_rows
 from timing import table
 
@@ -56,8 +57,8 @@ PARTS = {
 }
 
 
-def with_section(text: str, section: str) -> str:
-    """Return a page with the section between its two marks replaced.
+def with_section(text: str, between: str) -> str:
+    """Return a page with what stands between its two marks replaced.
 
     Raises:
         UserError: the marks are not there.
@@ -66,7 +67,7 @@ def with_section(text: str, section: str) -> str:
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise UserError(f"the page for the table lacks the lines {BEGIN} and {END}")
-    return f"{before}{BEGIN}\n\n{section}\n\n{END}{after}"
+    return f"{before}{BEGIN}\n\n{between}\n\n{END}{after}"
 
 
 def measured(name: str, words: list[str], work: Path, again: bool) -> Found:
@@ -145,7 +146,7 @@ def main(
         f"{facts['processor']}, {facts['cores']} cores. Every figure, with the day and the code of each part: "
         f"[{out}]({out})."
     )
-    write_text(page, with_section(page.read_text(), f"{lines}\n\n{where}"))
+    write_text(page, with_section(page.read_text(), "\n\n".join(filter(None, [lines, where, section(found)]))))
     click.echo(lines)
 
 
