@@ -51,6 +51,7 @@ PARTS = {
     "loading": Part("loading", ("--shards", "{shards}")),
     "training": Part("training", ("--shards", "{shards}")),
     "estimators": Part("estimators", ("--shards", "{shards}")),
+    "roofline": Part("roofline", ("--shards", "{shards}")),
     "decision": Part("decision"),
     "evaluation": Part("evaluation", ("{run}", "--episodes", "512", "--rival-episodes", "128")),
     "time_to_quality": Part("time_to_quality", ("--shards", "{shards}", "--seeds", "3", "--work", "{own}")),

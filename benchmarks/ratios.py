@@ -64,6 +64,10 @@ def _estimator(name: str) -> Callable[[Found], Any]:
     return lambda found: row_where(found["rows"], estimator=name)["times mc"]
 
 
+def _roofline(name: str) -> Callable[[Found], Any]:
+    return lambda found: row_where(found["rows"], training=name)["share of the roof"]
+
+
 def _training(name: str) -> Callable[[Found], Any]:
     return lambda found: row_where(found["rows"], training=f"{name}, graspq")["times its rival"]
 
@@ -150,6 +154,12 @@ RATIOS = (
         *BESIDE,
     ),
     Ratio("training", "… of `ddpg`, against d3rlpy's own, smaller network", _training("ddpg"), *BESIDE),
+    Ratio(
+        "roofline",
+        "operations a second of training `mc`, against those of a matrix product on the same device",
+        _roofline("mc"),
+        *BESIDE,
+    ),
     Ratio("estimators", "transitions a second of `dql`, against `mc`", _estimator("dql"), *at_least(0.5)),
     Ratio("estimators", "… of `corr-mc`", _estimator("corr-mc"), *at_least(0.4)),
     Ratio(

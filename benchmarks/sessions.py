@@ -8,6 +8,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from graspq.datasets.pool import ShardPool
+from graspq.evaluate.settings import Device
 from graspq.train.batch import Batch
 from graspq.train.batches import training_batches
 from graspq.train.loop import Session
@@ -16,9 +17,11 @@ from graspq.train.settings import TrainSettings, preset_settings
 B = TypeVar("B")
 
 
-def default_settings(algo: str, shards: tuple[str, ...], out: Path, threads: int | None) -> TrainSettings:
-    """Return the default settings, on the CPU; without the rest of ddpg's actor, which works in most of a training."""
-    return preset_settings("default", algo=algo, shards=shards, out=out, threads=threads, device="cpu", actor_rest=0.0)
+def default_settings(
+    algo: str, shards: tuple[str, ...], out: Path, threads: int | None, device: Device = "cpu"
+) -> TrainSettings:
+    """Return the default settings, without the rest of ddpg's actor, which works in most of a training."""
+    return preset_settings("default", algo=algo, shards=shards, out=out, threads=threads, device=device, actor_rest=0.0)
 
 
 def ready(current: Session, pool: ShardPool, count: int) -> list[Batch]:
