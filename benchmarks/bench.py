@@ -48,7 +48,8 @@ class Part:
 PARTS = {
     "collection": Part("collection", ("--part", "pace", "--part", "profile", "--part", "scaling")),
     "worker_memory": Part("collection", ("--part", "memory", "--scenes", "10000")),
-    "loading": Part("loading", ("--shards", "{shards}")),
+    "loading": Part("loading", ("--shards", "{shards}", "--part", "speed", "--part", "waiting")),
+    "streaming_memory": Part("loading", ("--shards", "{shards}", "--part", "memory")),
     "training": Part("training", ("--shards", "{shards}")),
     "estimators": Part("estimators", ("--shards", "{shards}")),
     "roofline": Part("roofline", ("--shards", "{shards}")),

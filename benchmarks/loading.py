@@ -169,7 +169,7 @@ def scratch_folder(given: Path | None) -> Iterator[Path]:
 @click.option("--turns", type=click.IntRange(1), default=5, show_default=True, help="Turns that are measured.")
 @click.option("--rival-batches", type=click.IntRange(1), default=None, help="The rivals'; an epoch if not given.")
 @click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Training steps in a turn.")
-@click.option("--memory-steps", type=click.IntRange(8), default=1200, show_default=True, help="Of the memory test.")
+@click.option("--memory-steps", type=click.IntRange(8), default=2400, show_default=True, help="Of the memory test.")
 @click.option("--threads", type=click.IntRange(1), default=None, help="CPU threads; torch's own choice if not given.")
 @click.option(
     "--part",

@@ -45,9 +45,9 @@ def test_shares_are_shown_in_percent_and_must_stay_below_their_bar() -> None:
     found = {
         "rows": [{"loader": name, "times PNG files": 12.0} for name in loaders],
         "waiting for data in training": waiting,
-        "resident memory of streaming": [{"growth": 0.004}],
     }
-    rows = ratio_rows({"loading": found}, dict.fromkeys(bench.PARTS, "c"))
+    memory = {"rows": [{"growth": 0.004}]}
+    rows = ratio_rows({"loading": found, "streaming_memory": memory}, dict.fromkeys(bench.PARTS, "c"))
     shares = [(row["measured"], row["met"]) for row in rows if "%" in str(row["measured"])]
     assert shares == [("5.1%", "**no**"), ("1.2%", "yes"), ("0.4%", "yes")]
 
