@@ -137,10 +137,8 @@ def main(
     for name, part in PARTS.items():
         words = part.words(shards=shards, run=run, own=(work / name).as_posix())
         commands[name] = f"python {' '.join(words)}"
-        if name in parts or name in again or not parts:
+        if not parts or name in (*parts, *again) or (work / f"{name}.json").exists():
             found[name] = measured(name, words, work, name in again)
-        elif (work / f"{name}.json").exists():
-            found[name] = measured(name, words, work, False)
     lines = table(ratio_rows(found, commands))
     facts = {"processor": processor(), "cores": available_cores()}
     write_json(out, {**facts, "commands": commands, "parts": found})

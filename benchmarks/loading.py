@@ -98,14 +98,14 @@ def rival_runs(pool: ShardPool, folder: Path, batch_size: int, batches: int, wor
     """Make the rivals and return, for each, what runs and how many samples it takes."""
     data = rivals.Table(pool)
     transitions, size = known(data), (batch_size, workers)
-    makers: dict[str, tuple[Callable[[], rivals.Epoch], int]] = {
-        PNG: (lambda: rivals.png_files(data, folder / "png", *size), batches),
-        "Hugging Face datasets, map-style": (lambda: rivals.hugging_face_map(pool, folder / "arrow", *size), batches),
-        "Hugging Face datasets, streaming": (lambda: rivals.hugging_face_stream(pool, *size), batches),
-        "LeRobot-style random access": (lambda: rivals.lerobot_style(data, folder / "lerobot", *size), batches),
+    makers: dict[str, Callable[[], rivals.Epoch]] = {
+        PNG: lambda: rivals.png_files(data, folder / "png", *size),
+        "Hugging Face datasets, map-style": lambda: rivals.hugging_face_map(pool, folder / "arrow", *size),
+        "Hugging Face datasets, streaming": lambda: rivals.hugging_face_stream(pool, *size),
+        "LeRobot-style random access": lambda: rivals.lerobot_style(data, folder / "lerobot", *size),
     }
     runs: dict[str, Run] = {}
-    for name, (make, count) in makers.items():
+    for name, make in makers.items():
         try:
             epoch = make()
         except ImportError as error:
@@ -113,7 +113,7 @@ def rival_runs(pool: ShardPool, folder: Path, batch_size: int, batches: int, wor
             continue
         check(name, epoch, transitions)
         # Each worker's last batch may be too small to count.
-        runs[name] = (lambda epoch=epoch, count=count: consume(epoch(), count, workers)), batch_size * count
+        runs[name] = (lambda epoch=epoch: consume(epoch(), batches, workers)), batch_size * batches
     return runs
 
 

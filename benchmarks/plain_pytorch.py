@@ -167,15 +167,18 @@ class PlainTraining:
     `reward` float32 [B], `terminal` bool [B], and for `dql` `next_image` and `next_step`.
     """
 
-    def __init__(self, network: PlainNetwork, settings: Any, discount: float, bootstrapped: bool) -> None:
-        self.network, self.settings, self.discount, self.bootstrapped = network, settings, discount, bootstrapped
+    def __init__(
+        self, network: PlainNetwork, settings: Any, discount: float, bootstrapped: bool, tiled: bool = False
+    ) -> None:
+        self.network, self.settings, self.discount = network, settings, discount
+        self.bootstrapped, self.tiled = bootstrapped, tiled
         self.average = copy.deepcopy(network).eval()
         self.target_network = copy.deepcopy(network).eval()
         matrices = [parameter for parameter in network.parameters() if parameter.dim() > 1]
         others = [parameter for parameter in network.parameters() if parameter.dim() <= 1]
         groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=settings.learning_rate, foreach=False, fused=False)
-        self.step, self.tiled = 0, False
+        self.step = 0
 
     def update(self, batch: dict[str, Tensor]) -> Tensor:
         """Take one gradient step; return the loss."""

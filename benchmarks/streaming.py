@@ -90,7 +90,8 @@ def waiting_rows(
 
 
 def _memory_of_training(shards: tuple[str, ...], steps: int, threads: int | None) -> dict[str, Any]:
-    kept, held_back = (pool := open_shards(shards)).split(0.05, 0)
+    pool = open_shards(shards)
+    kept, held_back = pool.split(0.05, 0)
     start, seen = resident_bytes() / 2**20, []
     with tempfile.TemporaryDirectory() as folder:
         settings = default_settings("mc", shards, Path(folder) / "mc", threads)

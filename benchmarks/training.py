@@ -58,10 +58,10 @@ def plain_batch(batch: Batch) -> dict[str, Tensor]:
     return {n: v.permute(0, 3, 1, 2).contiguous() if n.endswith("image") else v for n, v in flat.items()}
 
 
-def plain_training(current: Session) -> PlainTraining:
-    """Return plain training that starts with a run's weights."""
+def plain_training(current: Session, tiled: bool = False) -> PlainTraining:
+    """Return plain training that starts with a run's weights; see `PlainTraining` for `tiled`."""
     network = plain_copy(current.state.learned["q"], current.specification.steps - 1)
-    return PlainTraining(network, current.settings, current.discount, current.estimator.needs_next)
+    return PlainTraining(network, current.settings, current.discount, current.estimator.needs_next, tiled)
 
 
 def greatest_difference(current: Session, plain: PlainTraining, batch: Batch) -> float:
@@ -93,10 +93,7 @@ def greatest_difference(current: Session, plain: PlainTraining, batch: Batch) ->
         current.state.learned["q"].eval()
         candidates = uniform_actions(torch.Generator().manual_seed(2), rows, settings.candidates)
         target = current.estimator.target(batch, context).squeeze(1)
-        for tiled in (False, True):
-            plain.tiled = tiled
-            differences.append(target - plain.double_q(theirs, theirs["next_image"].float(), candidates))
-        plain.tiled = False
+        differences.append(target - plain.double_q(theirs, theirs["next_image"].float(), candidates))
     return max(float(difference.abs().max()) for difference in differences)
 
 
@@ -178,8 +175,8 @@ def rivals_of(current: Session, batches: list[Batch]) -> dict[str, tuple[Callabl
     theirs = [plain_batch(batch) for batch in batches]
     found[f"{algo}, plain PyTorch"] = steps_on(theirs, plain.update), size * len(theirs)
     if plain.bootstrapped:
-        tiled = plain_training(current)
-        tiled.tiled = True
+        tiled = plain_training(current, tiled=True)
+        check_agreement(current, tiled, batches[0])
         # Sixteen copies of every picture take seconds.
         found[f"{algo}, {TILED}"] = steps_on(theirs[:1], tiled.update), size
     return found

@@ -63,8 +63,7 @@ def test_the_plain_augmentation_gives_our_pictures_and_actions(states):
 def test_the_plain_target_is_ours(network, states, tiled):
     image, step, _ = states
     settings = preset_settings("default", algo="dql", shards=("none",))
-    plain = PlainTraining(plain_copy(network, T - 1), settings, 0.9, bootstrapped=True)
-    plain.tiled = tiled
+    plain = PlainTraining(plain_copy(network, T - 1), settings, 0.9, bootstrapped=True, tiled=tiled)
     terminal = torch.tensor([False, True, False, False, True, False])
     reward = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     candidates = uniform_actions(seeded("tests/benchmarks/candidates"), B)
