@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # What each folder may import (DESIGN, section 1).
 MAY_IMPORT = {
     "common": set(),
+    "engine": {"common"},
     "objects": {"common"},
     "sim": {"objects", "common"},
     "datasets": {"common"},
