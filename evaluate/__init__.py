@@ -1,4 +1,4 @@
-"""Scoring of policies: rollouts on held-out objects, statistics, batch jobs and the report.
+"""Scoring of policies: rollouts on held-out objects, statistics and batch jobs.
 
-Statistics, jobs and reports import neither PyBullet nor PyTorch; only rollouts need the simulator.
+Statistics and jobs import neither PyBullet nor PyTorch; only rollouts need the simulator.
 """

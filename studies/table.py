@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from graspq.common.files import write_text
-from graspq.evaluate.report_sweeps import SWEEP_FILE
+from graspq.report.stability import SWEEP_FILE
 from graspq.studies.state import State
 
 VARIED = ("algo", "learning_rate", "width", "discount", "exploration_steps", "seed")

@@ -22,8 +22,9 @@ MAY_IMPORT = {
     "datagen": {"sim", "objects", "datasets", "common"},
     "train": {"datasets", "common"},
     "evaluate": {"sim", "objects", "train", "datasets", "common"},
+    "report": {"evaluate", "train", "datasets", "objects", "common"},
     "online": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
-    "studies": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "common"},
+    "studies": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "report", "common"},
 }
 
 
@@ -57,8 +58,8 @@ def test_pybullet_is_imported_inside_sim_alone(folder):
 def test_training_data_tools_and_reports_run_without_pybullet(tmp_path):
     code = (
         "import sys; sys.modules['pybullet'] = None; sys.modules['pybullet_data'] = None\n"
-        "import graspq, graspq.train.cli, graspq.train.loop, graspq.datasets.cli, graspq.evaluate.report_cli\n"
-        "import graspq.objects.cli, graspq.datagen.cli, graspq.evaluate.cli, graspq.evaluate.report\n"
+        "import graspq, graspq.train.cli, graspq.train.loop, graspq.datasets.cli, graspq.report.cli\n"
+        "import graspq.objects.cli, graspq.datagen.cli, graspq.evaluate.cli, graspq.report.page\n"
     )
     subprocess.run([sys.executable, "-P", "-c", code], check=True, cwd=tmp_path, timeout=120)
 

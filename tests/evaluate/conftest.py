@@ -60,9 +60,8 @@ class Command:
 
     def __call__(self, name: str, *arguments: str | Path) -> SimpleNamespace:
         from graspq.evaluate.cli import main as grasp_eval
-        from graspq.evaluate.report_cli import main as grasp_report
 
-        main = {"grasp-eval": grasp_eval, "grasp-report": grasp_report}[name]
+        main = {"grasp-eval": grasp_eval}[name]
         self._capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main([str(argument) for argument in arguments], prog_name=name)

@@ -12,8 +12,8 @@ from graspq.common.errors import UserError
 from graspq.common.options import flag
 from graspq.evaluate.policies import ORACLE, RANDOM
 from graspq.evaluate.records import Evaluation
-from graspq.evaluate.report_data import Findings, RunData, Scenes, Score, comparisons
 from graspq.evaluate.statistics import mean_over_seeds
+from graspq.report.findings import Findings, RunData, Scenes, Score, comparisons
 
 REFERENCE_COLORS = {RANDOM: 8, ORACLE: 9}
 PER_RUN = ("seed", "out")  # settings in which runs of one experiment may differ

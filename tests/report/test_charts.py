@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from graspq.evaluate.charts import PLOT, Series, line_chart, nice_ticks, thinned, tick_label
+from graspq.report.charts import PLOT, Series, line_chart, nice_ticks, thinned, tick_label
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
-from graspq.evaluate.charts import LineChart, Series, line_chart
+from graspq.report.charts import LineChart, Series, line_chart
 
 SWEEP_FILE = "sweep.jsonl"
 MOST_DOTS = 40  # more runs than these are a line alone

@@ -4,19 +4,20 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from graspq.evaluate.films import Film, write_films
 from graspq.evaluate.records import EpisodeRow, Evaluation, write_rows, write_summary
-from graspq.evaluate.report import render, write_report
-from graspq.evaluate.report_data import calibration_of, comparisons, gather
 from graspq.evaluate.statistics import paired_difference, wilson_interval
+from graspq.report.findings import calibration_of, comparisons, gather
+from graspq.report.page import render, write_report
 
 VOID = {"meta", "img", "br", "line", "rect", "circle", "path", "input", "link"}
 
@@ -179,29 +180,28 @@ def test_calibration_of_rollouts_is_binned_by_q() -> None:
 
 
 def test_the_command_writes_the_page_and_refuses_what_holds_nothing(
-    run_folder: Path, command: Any, tmp_path: Path
+    run_folder: Path, grasp_report: Callable[..., SimpleNamespace], tmp_path: Path
 ) -> None:
-    done = command("grasp-report", run_folder, "--out", tmp_path / "report.html", "--title", "Two <networks>")
+    done = grasp_report(run_folder, "--out", tmp_path / "report.html", "--title", "Two <networks>")
     assert done.code == 0
     assert "Two &lt;networks&gt;" in (tmp_path / "report.html").read_text()
     (tmp_path / "empty").mkdir()
     for folder, said in (("absent", "no such folder"), ("empty", "neither a run of grasp-train")):
-        done = command("grasp-report", tmp_path / folder, "--out", tmp_path / "none.html")
+        done = grasp_report(tmp_path / folder, "--out", tmp_path / "none.html")
         assert done.code == 2 and len(done.lines) == 1 and said in done.lines[0]
     (tmp_path / "file").write_text("")
-    done = command("grasp-report", run_folder, "--out", tmp_path / "file" / "report.html")
+    done = grasp_report(run_folder, "--out", tmp_path / "file" / "report.html")
     assert done.code == 2 and "cannot write the report here" in done.lines[0]
     assert not (tmp_path / "none.html").exists()
 
 
-def test_reports_statistics_and_plans_do_not_import_the_simulator(scored: Path) -> None:
+def test_a_report_is_made_without_the_simulator(scored: Path) -> None:
     script = (
         "import sys; sys.modules['pybullet'] = None\n"
-        "import graspq.evaluate.cli, graspq.evaluate.statistics, graspq.evaluate.jobs, graspq.evaluate.batch\n"
-        "from pathlib import Path; from graspq.evaluate.report import write_report\n"
+        "from pathlib import Path; from graspq.report.page import write_report\n"
         f"write_report([Path({str(scored / 'runs')!r})], Path({str(scored / 'out.html')!r}))\n"
         "print([name for name in sys.modules if name.startswith('graspq.sim')])\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], cwd=scored, capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-P", "-c", script], cwd=scored, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"

@@ -11,12 +11,12 @@ import jinja2
 import graspq
 from graspq.common.errors import UserError
 from graspq.common.files import write_text
-from graspq.evaluate.charts import PLOT
 from graspq.evaluate.policies import ORACLE, RANDOM
-from graspq.evaluate.report_data import Findings, RunData, Score, gather
-from graspq.evaluate.report_figures import calibration_charts, film_groups, learning_curves
-from graspq.evaluate.report_sweeps import stability_of
-from graspq.evaluate.report_tables import (
+from graspq.report.charts import PLOT
+from graspq.report.figures import calibration_charts, film_groups, learning_curves
+from graspq.report.findings import Findings, RunData, Score, gather
+from graspq.report.stability import stability_of
+from graspq.report.tables import (
     command_lines,
     evaluation_row,
     interval_text,
@@ -36,7 +36,7 @@ def write_report(
     """Write a report on the runs, evaluations and sweeps in some folders, atomically.
 
     Args:
-        folders: see `report_data.gather`.
+        folders: see `findings.gather`.
         out: the HTML file.
         title: heading; a sentence on the best result by default.
         baselines: where else to look for evaluations of the random policy and the oracle.
@@ -54,7 +54,7 @@ def write_report(
 def render(findings: Findings, title: str | None = None) -> str:
     """Return the page for what was found."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("graspq.evaluate"),
+        loader=jinja2.PackageLoader("graspq.report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

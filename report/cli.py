@@ -1,6 +1,6 @@
 """`grasp-report`: one HTML page on runs and their evaluations, to look at and to send to others.
 
-The way on: `report` (the page) -> `report_data` (what was found) and `charts` (geometry) -> `templates/report.html`.
+The way on: `page` -> `findings` (what was found) and `charts` (geometry) -> `templates/report.html`.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ def main(settings: ReportSettings) -> None:
       grasp-report runs/quickstart --out runs/quickstart/report.html
       grasp-report runs/sweep-small --out sweep.html
     """
-    from graspq.evaluate.report import write_report
+    from graspq.report.page import write_report
 
     write_report(settings.folders, settings.out, title=settings.title, baselines=settings.baselines)
     click.echo(f"report: {settings.out}")

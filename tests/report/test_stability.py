@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.evaluate.charts import PLOT
-from graspq.evaluate.report import render
-from graspq.evaluate.report_data import gather
-from graspq.evaluate.report_sweeps import Sweep, find_sweeps, stability_chart, stability_of
+from graspq.report.charts import PLOT
+from graspq.report.findings import gather
+from graspq.report.page import render
+from graspq.report.stability import Sweep, find_sweeps, stability_chart, stability_of
 
 RATES = {"dql": [0.25, 0.75, None, 0.5], "mc": [0.5, "to do"]}
 

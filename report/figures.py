@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from graspq.evaluate.charts import LineChart, Series, line_chart, thinned
 from graspq.evaluate.films import Film, read_films
-from graspq.evaluate.report_data import Findings, RunData, calibration_of
+from graspq.report.charts import LineChart, Series, line_chart, thinned
+from graspq.report.findings import Findings, RunData, calibration_of
 
 
 def learning_curves(runs: Sequence[RunData], colors: dict[str, int]) -> list[LineChart]:
