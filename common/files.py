@@ -1,19 +1,26 @@
-"""Files that are either wholly there or not there: written under a temporary name, synced, checked, renamed.
+"""Files and folders that are either wholly there or not there: written under a temporary name, synced, renamed.
 
-After a crash at any moment a reader sees the old file or the new one, never a part of one.
+After a crash at any moment a reader sees the old one or the new one, never a part of one.
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
+import shutil
+import socket
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
+
 from graspq.common.errors import UserError
 
 TEMPORARY_PREFIX = ".tmp-"
+LOCK_NAME = ".lock"
 
 
 def sha256_of(path: Path) -> str:
@@ -23,7 +30,7 @@ def sha256_of(path: Path) -> str:
 
 
 def fsync_folder(folder: Path) -> None:
-    """Make a rename inside `folder` durable."""
+    """Make a rename inside `folder` durable; the content of a file likewise."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -43,7 +50,7 @@ def committed(path: Path, verify: Callable[[Path], None] | None = None) -> Itera
         Whatever the body or `verify` raises; the temporary file is then removed and `path` is untouched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
+    temporary = _temporary(path)
     try:
         yield temporary
         with temporary.open("rb") as file:
@@ -55,6 +62,132 @@ def committed(path: Path, verify: Callable[[Path], None] | None = None) -> Itera
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def committed_folder(
+    path: Path, *, replace: bool = False, compare: Callable[[Path, Path], None] | None = None
+) -> Iterator[Path]:
+    """Yield an empty temporary folder beside `path`; on leaving without an error, sync it and rename it to `path`.
+
+    Where `path` is already there and not empty, made by a faster process or long ago, that one is kept and the new
+    one dropped, unless `replace` is set.
+
+    Args:
+        path: the final place; its parent is made if need be.
+        replace: the new folder takes the place of one that is there. A process that is killed between two renames
+            leaves neither, so the name must be one that can be made again.
+        compare: called with the new folder and the one that is there, where that one is kept; raises if they differ.
+
+    Raises:
+        Whatever the body or `compare` raises; the temporary folder is then removed and `path` is untouched.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_orphans(path)
+    temporary = _temporary(path)
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        yield temporary
+        for part in [*temporary.rglob("*"), temporary]:
+            fsync_folder(part)
+        if replace and path.exists():
+            remove_folder(path)
+        try:
+            temporary.replace(path)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            if compare is not None:
+                compare(temporary, path)
+        fsync_folder(path.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_folder(path: Path) -> None:
+    """Remove a folder so that a reader finds it whole or not at all: it first takes a temporary name."""
+    leaving = path.with_name(f"{_temporary(path).name}-old")
+    path.replace(leaving)
+    shutil.rmtree(leaving, ignore_errors=True)
+
+
+def _temporary(path: Path) -> Path:
+    return path.parent / f"{TEMPORARY_PREFIX}{socket.gethostname()}-{os.getpid()}-{path.name}"
+
+
+def _remove_orphans(path: Path) -> None:
+    """Remove what writers of `path` that were killed on this machine have left beside it."""
+    mine = f"{TEMPORARY_PREFIX}{socket.gethostname()}-"
+    for leftover in path.parent.glob(f"{mine}*-{path.name}*"):
+        owner = leftover.name.removeprefix(mine).split("-")[0]
+        if owner.isdigit() and not _alive(int(owner)):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+@contextlib.contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """Hold `folder` for this process alone; a process that is killed holds nothing any more.
+
+    The lock is the library filelock's, which PyTorch needs anyway: flock on an empty file `.lock` that stays there.
+
+    Args:
+        folder: the folder, which is there and can be written to.
+        what: what works in it, such as `"grasp-datagen"`.
+
+    Raises:
+        UserError: another process holds it.
+    """
+    lock = filelock.FileLock(folder / LOCK_NAME, timeout=0)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise UserError(
+            f"{folder}: another {what} works here; wait for its end, or choose another folder with --out"
+        ) from None
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be locked for {what} ({error.strerror}); choose another folder") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def cache_folder(*parts: str) -> Path:
+    """Return `parts` below this user's cache of graspq: $XDG_CACHE_HOME/graspq, or ~/.cache/graspq.
+
+    The cache itself is made; what `parts` name is not. Where it cannot be made or written to, a private folder of this
+    user in the folder for temporary files takes its place.
+    """
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    base = Path(given) if Path(given).is_absolute() else Path.home() / ".cache"
+    cache = base / "graspq"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        usable = os.access(cache, os.W_OK | os.X_OK)
+    except OSError:
+        usable = False
+    return (cache if usable else _private_cache()).joinpath(*parts)
+
+
+def _private_cache() -> Path:
+    cache = Path(tempfile.gettempdir()) / f"graspq-cache-{os.getuid()}"
+    with contextlib.suppress(FileExistsError):
+        cache.mkdir(mode=0o700)
+    found = cache.lstat()
+    if not cache.is_dir() or cache.is_symlink() or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise UserError(f"{cache}: another user's, or open to others; set XDG_CACHE_HOME to a folder of your own")
+    return cache
 
 
 def write_text(path: Path, text: str) -> None:
@@ -87,9 +220,15 @@ def read_json(path: Path, what: str) -> Any:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove what earlier, killed writers of this module left in `folder`; nothing else is touched."""
+    """Remove the files and folders that earlier, killed writers of this module left in `folder`, nothing else.
+
+    The caller holds the folder's lock, so that no writer is at work.
+    """
     for leftover in folder.glob(f"{TEMPORARY_PREFIX}*"):
-        leftover.unlink(missing_ok=True)
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)
 
 
 def writable_folder(folder: Path, what: str) -> Path:

@@ -1,9 +1,18 @@
+import os
+import signal
+import subprocess
+import sys
+
 import pytest
 
 from graspq.common.errors import UserError
 from graspq.common.files import (
+    cache_folder,
     committed,
+    committed_folder,
+    locked,
     read_json,
+    remove_folder,
     remove_temporaries,
     sha256_of,
     writable_folder,
@@ -45,6 +54,8 @@ def test_json_is_read_back_and_bad_json_is_the_users_mistake(tmp_path):
 
 def test_only_our_own_temporaries_are_removed(tmp_path):
     (tmp_path / ".tmp-1-shard").touch()
+    (tmp_path / ".tmp-1-checkpoint").mkdir()
+    (tmp_path / ".tmp-1-checkpoint" / "weights").touch()
     (tmp_path / "notes.tmp").touch()
     remove_temporaries(tmp_path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["notes.tmp"]
@@ -59,3 +70,88 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
 def test_the_digest_is_that_of_the_bytes(tmp_path):
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256_of(tmp_path / "file").startswith("ba7816bf8f01cfea")
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "folder"
+    with committed_folder(path) as temporary:
+        (temporary / "a").write_text("1")
+        (temporary / "deep").mkdir()
+        (temporary / "deep" / "b").write_text("2")
+        assert not path.exists()
+    assert (path / "deep" / "b").read_text() == "2"
+    with pytest.raises(RuntimeError, match="midway"), committed_folder(path, replace=True) as temporary:
+        raise RuntimeError("midway")
+    assert (path / "a").read_text() == "1"
+    assert [entry.name for entry in path.parent.iterdir()] == ["folder"]
+
+
+def test_a_folder_that_is_there_is_kept_replaced_or_compared(tmp_path):
+    path = tmp_path / "folder"
+
+    def make(text, **how):
+        with committed_folder(path, **how) as temporary:
+            (temporary / "a").write_text(text)
+
+    def differ(made, there):
+        if (made / "a").read_text() != (there / "a").read_text():
+            raise ValueError("another one")
+
+    make("first")
+    make("second")
+    assert (path / "a").read_text() == "first"
+    with pytest.raises(ValueError, match="another one"):
+        make("second", compare=differ)
+    make("first", compare=differ)
+    make("second", replace=True)
+    assert (path / "a").read_text() == "second"
+    remove_folder(path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_maker_left_is_removed_by_the_next(tmp_path):
+    code = """
+import os, signal, sys
+from pathlib import Path
+from graspq.common.files import committed_folder
+with committed_folder(Path(sys.argv[1])) as temporary:
+    (temporary / "half").touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    path = tmp_path / "folder"
+    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
+    with committed_folder(path) as temporary:
+        (temporary / "whole").touch()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+def test_one_process_holds_a_folder_and_a_killed_one_holds_nothing(tmp_path):
+    code = """
+import sys, time
+from pathlib import Path
+from graspq.common.files import locked
+with locked(Path(sys.argv[1]), "holder"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", code, tmp_path], stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(UserError, match="another grasp-datagen works here"), locked(tmp_path, "grasp-datagen"):
+            pass
+        holder.kill()
+    with locked(tmp_path, "grasp-datagen"), pytest.raises(UserError), locked(tmp_path, "grasp-datagen"):
+        pass
+
+
+def test_the_cache_is_where_the_user_says_and_private_where_home_is_not_to_be_written(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert cache_folder("a", "b") == tmp_path / "cache" / "graspq" / "a" / "b"
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    private = cache_folder()
+    assert private == tmp_path / f"graspq-cache-{os.getuid()}" and private.stat().st_mode & 0o777 == 0o700
+    private.chmod(0o777)
+    with pytest.raises(UserError, match="open to others"):
+        cache_folder()
