@@ -27,11 +27,10 @@ from timing import median_ratio, report, take_turns
 from graspq.common.options import Command
 from graspq.datagen import workers as pool
 from graspq.datagen.settings import CollectionSettings
+from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
-from graspq.sim.environments import default_objects
 
 OURS, RIVAL = "graspq", "KukaDiverseObjectEnv"
-USUAL_OBJECTS = Path("data/objects/regular")
 RENEWED_AFTER = 2  # blocks, where renewal is shown
 Rows = list[dict[str, Any]]
 
@@ -179,7 +178,7 @@ PARTS = ("pace", "profile", "scaling", "memory")
     "--objects",
     type=click.Path(path_type=Path),
     default=None,
-    help=f"Folder of the object set; {USUAL_OBJECTS}, or the project's own set, if not given.",
+    help="Folder of the object set; the project's own if not given.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of scenes and actions.")
 @click.option("--turns", type=click.IntRange(1), default=7, show_default=True, help="Turns that are measured.")
@@ -200,8 +199,7 @@ def main(
     out: Path | None,
 ) -> None:
     """Measure collection: pace against the rival, profile of a grasp, scaling over workers, memory of a worker."""
-    folder = objects or (USUAL_OBJECTS if USUAL_OBJECTS.is_dir() else default_objects("regular"))
-    ObjectSet.load(folder)  # a wrong folder is refused here
+    folder = (ObjectSet.load(objects) if objects is not None else default_object_set("regular")).folder
     chosen = [part for part in PARTS if part in parts or not parts]
     tables: dict[str, Rows] = {}
     facts: dict[str, Any] = {"turns": turns, "grasps a turn": blocks * CollectionSettings().block_size}

@@ -31,9 +31,8 @@ from graspq.datasets.card import write_card
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
+from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
-from graspq.objects.procedural import make_procedural
-from graspq.objects.targeted import make_targeted
 from graspq.sim.task import TaskSettings, draw_objects, task_settings
 
 VERSIONS = ("numpy", "scipy", "pybullet", "pyarrow", "trimesh")
@@ -115,12 +114,7 @@ def _object_set(settings: DatagenSettings, folder: Path, existing: Manifest | No
         return ObjectSet.load(settings.objects)
     if existing is not None and (folder / "objects" / "object_set.json").is_file():
         return ObjectSet.load(folder / "objects")
-    place = folder.parent / "objects" / settings.task
-    if not (place / "object_set.json").is_file():
-        writable_folder(place.parent, "object set")
-        click.echo(f"making the object set {place} (once; about half a minute)")
-        (make_procedural if settings.task == "regular" else make_targeted)(place, seed=0)
-    return ObjectSet.load(place)
+    return default_object_set(settings.task)
 
 
 def _require_same(folder: Path, existing: Manifest, fresh: Manifest) -> None:

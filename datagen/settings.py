@@ -21,7 +21,7 @@ class DatagenSettings(Settings):
     )
     out: Path | None = setting(None, help="dataset folder; data/<task>-<size> if not given")
     objects: Path | None = setting(
-        None, help="folder of an object set; made beside the dataset (objects/<task>) if not given"
+        None, help="folder of an object set; if not given, the task's own, which is made once in the user's cache"
     )
     seed: int = setting(0, help="seed of the dataset; with it every byte is determined", minimum=0)
     workers: int | None = setting(None, help="processes that simulate; the number of cores if not given", minimum=1)

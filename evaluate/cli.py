@@ -29,7 +29,7 @@ def main(settings: EvalSettings) -> int:
     Examples:
       grasp-eval runs/mc --episodes 1000
       grasp-eval 'runs/*' --policy random --policy oracle --out runs/scores
-      grasp-eval --policy my_policy:make --objects data/objects/regular
+      grasp-eval --policy my_policy:make
       grasp-eval --jobs jobs.toml
     """
     return evaluate(settings)

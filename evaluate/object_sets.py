@@ -1,6 +1,7 @@
 """Which object set an evaluation draws from, when the user does not say.
 
-A run remembers its data by their manifests: the object set is looked for beside those data, and recognised by digest.
+A run remembers its data by their manifests: the object set is looked for beside those data, and recognised by digest;
+then comes the task's own.
 """
 
 from collections.abc import Iterable
@@ -8,10 +9,10 @@ from pathlib import Path
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
+from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
 
 SET_FILE = "object_set.json"
-DEFAULT_FOLDER = Path("data/objects")
 
 
 def find_object_set(
@@ -27,26 +28,23 @@ def find_object_set(
         others: folders of sets that other jobs of the same plan use.
 
     Raises:
-        UserError: there is none, it is damaged, or it is another one than the run's.
+        UserError: the task has none of its own, it is damaged, or it is another one than the run's.
     """
     if asked is not None:
         folder = (
             asked if (asked / SET_FILE).is_file() or not (asked / "objects" / SET_FILE).is_file() else asked / "objects"
         )
         return _verified(folder)
-    candidates = [*(folder / "objects" for folder in datasets), *others, DEFAULT_FOLDER / task]
-    present = [folder for folder in candidates if (folder / SET_FILE).is_file()]
-    for folder in present:
-        if wanted is None or sha256_of(folder / SET_FILE) == wanted:
+    candidates = [*(folder / "objects" for folder in datasets), *others]
+    for folder in candidates:
+        if (folder / SET_FILE).is_file() and wanted in (None, sha256_of(folder / SET_FILE)):
             return _verified(folder)
-    make = f"make it with: grasp-objects make {'procedural' if task == 'regular' else task} {DEFAULT_FOLDER / task}"
-    if present:
+    own = default_object_set(task)
+    if wanted not in (None, own.digest()):
         raise UserError(
-            f"{present[0]}: not the object set of the run's data ({wanted}); name one with --objects FOLDER"
+            f"{own.folder}: not the object set of the run's data ({wanted}); name one with --objects FOLDER"
         )
-    raise UserError(
-        f"no object set for the {task} task in {DEFAULT_FOLDER / task}; name one with --objects FOLDER or {make}"
-    )
+    return _verified(own.folder)
 
 
 def _verified(folder: Path) -> ObjectSet:

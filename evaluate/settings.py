@@ -58,7 +58,7 @@ class EvalSettings(Settings):
     episodes: int = setting(1000, help="Episodes (grasps) of each job, such as 200 or 1k.", parse=parse_count)
     seed: int = setting(0, help="Seed of the scenes: the same seed gives every policy the same scenes.", minimum=0)
     objects: Path | None = setting(
-        None, help="Folder of the object set. Default: the one the run's data were made with, else data/objects/TASK."
+        None, help="Folder of the object set. Default: the one the run's data were made with, else the task's own."
     )
     checkpoint: int | None = setting(None, help="Training step of the checkpoint. Default: the last.", minimum=0)
     workers: int | None = setting(None, help="Simulator processes, all cores by default; changes no result.", minimum=1)

@@ -3,7 +3,6 @@
 Each environment owns its physics client, so several live in one process.
 """
 
-import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,22 +11,12 @@ import numpy as np
 from gymnasium import spaces
 
 from graspq.common.errors import UserError
+from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
-from graspq.objects.procedural import make_procedural
-from graspq.objects.targeted import make_targeted
 from graspq.sim.episode import GraspSimulation
 from graspq.sim.task import EPISODES_PER_BIN, TASKS, draw_objects, splits_of
 
 _RENDER_SIZE = 256
-
-
-def default_objects(task: str) -> Path:
-    """Return the folder of the project's own object set of a task, in the user's cache; made on first use."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = cache / "graspq" / "objects" / task
-    if not (folder / "object_set.json").exists():
-        (make_procedural if task == "regular" else make_targeted)(folder, seed=0)
-    return folder
 
 
 class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
@@ -67,7 +56,7 @@ class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.task = TASKS[self.task_name]
         if split not in splits_of(self.task):
             raise UserError(f"split {split!r}: the {self.task_name} task has {', '.join(splits_of(self.task))}")
-        self.objects = ObjectSet.load(Path(objects) if objects is not None else default_objects(self.task_name))
+        self.objects = ObjectSet.load(objects) if objects is not None else default_object_set(self.task_name)
         self.split, self.render_mode = split, render_mode
         size = self.task.image_size
         self.observation_space = spaces.Dict(

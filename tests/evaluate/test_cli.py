@@ -195,7 +195,6 @@ def test_a_users_policy_is_scored_and_filmed_by_the_same_command(
         (("--policy", "random", "--episodes", "-3"), "expected a whole number of at least 1"),
         (("--policy", "random", "--episodes", "many"), "expected a whole number of at least 1"),
         (("--policy", "random", "--seed", "-1"), "expected a number of at least 0"),
-        (("--policy", "random"), "name one with --objects FOLDER or make it with: grasp-objects make"),
         (("--policy", "random", "--objects", "absent"), "absent/object_set.json: no object set"),
         (("--policy", "random", "--objects", "OBJECTS", "--split", "validation"), "split 'validation'"),
         (("--policy", "random", "--objects", "OBJECTS", "--task", "targeted"), "'target'"),
@@ -241,7 +240,7 @@ def test_a_damaged_mesh_is_refused_before_anything_runs(objects_folder: Path, co
 def test_another_object_set_than_the_runs_must_be_asked_for(
     run_folder: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from graspq.objects.procedural import make_procedural
+    from graspq.objects.procedural import GENERATOR_VERSION, make_procedural
 
     monkeypatch.chdir(tmp_path)
     moved = tmp_path / "run"
@@ -249,10 +248,11 @@ def test_another_object_set_than_the_runs_must_be_asked_for(
     config = json.loads((moved / "config.json").read_text())
     config["dataset"]["object_set"] = {"name": "procedural", "sha256": "0" * 64}
     (moved / "config.json").write_text(json.dumps(config))
-    make_procedural(tmp_path / "data/objects/regular", seed=1, train=5, test=5)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    own = make_procedural(tmp_path / f"graspq/objects/regular-{GENERATOR_VERSION}", seed=0, train=5, test=5)
     done = command("grasp-eval", moved, *SMALL, "--plan")
     assert done.code == 2 and "not the object set of the run's data" in done.lines[0]
-    assert command("grasp-eval", moved, *SMALL, "--plan", "--objects", "data/objects/regular").code == 0
+    assert command("grasp-eval", moved, *SMALL, "--plan", "--objects", own.folder).code == 0
 
 
 OWN_ROW = """
