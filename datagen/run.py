@@ -11,6 +11,7 @@ import click
 import numpy as np
 from tqdm import tqdm
 
+from graspq.common.action_space import grasping
 from graspq.common.errors import UserError
 from graspq.common.files import TEMPORARY_PREFIX, writable_folder
 from graspq.common.machine import available_cores
@@ -83,7 +84,7 @@ def describe(settings: DatagenSettings, task: TaskSettings, objects: ObjectSet) 
         versions=versions(*VERSIONS),
         object_set={"name": objects.name, "sha256": objects.digest()},
         image_shape=(task.image_size, task.image_size, 3),
-        action_limits=task.action_limits,
+        action=grasping(task.action_limits),
         discount=settings.discount,
         phi_range=(-task.phi_limit, task.phi_limit),
     )

@@ -146,7 +146,7 @@ def _pool(found: list[tuple[Dataset, ShardEntry]], named: str, verify: bool) -> 
         blocks=tuple(ref for dataset, entry in found for ref in _refs(dataset, entry, footers)),
         task=manifest.task,
         image_shape=manifest.image_shape,
-        action_limits=manifest.action_limits,
+        action=manifest.action,
         discount=manifest.discount,
         object_set=manifest.object_set,
         manifest_digest=manifest.digest() if whole else hashlib.sha256(digests.encode()).hexdigest(),
@@ -191,6 +191,7 @@ def _check_agreement(datasets: list[Dataset]) -> None:
             ("tasks", "task_name"),
             ("image shapes", "image_shape"),
             ("action limits", "action_limits"),
+            ("action spaces", "action"),
             ("discounts", "discount"),
         ):
             ours, theirs = getattr(first.manifest, name), getattr(other.manifest, name)

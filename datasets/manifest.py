@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.errors import UserError
 from graspq.common.files import read_json, write_json
 
@@ -92,11 +93,12 @@ class Manifest:
         versions: package → version, of what can change the bytes.
         object_set: `name` and `sha256`, the digest of `objects/object_set.json`.
         image_shape: (H, W, 3).
-        action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
+        action: what an action means.
         discount: γ of the stored `mc_return`.
-        phi_range: least and greatest unwrapped wrist angle φ, radians.
+        phi_range: least and greatest unwrapped wrist angle φ, radians; None where a pose has none.
         shards: ordered by first block, disjoint.
         files: SHA-256 of the other files that belong to it, such as `README.md`.
+        tells_action: whether the JSON holds `action`; a manifest that was read without it is written without it.
     """
 
     task: dict[str, Any]
@@ -104,12 +106,13 @@ class Manifest:
     versions: dict[str, str]
     object_set: dict[str, Any]
     image_shape: tuple[int, int, int]
-    action_limits: tuple[float, float, float, float]
+    action: ActionSpace
     discount: float
-    phi_range: tuple[float, float]
+    phi_range: tuple[float, float] | None = None
     shards: tuple[ShardEntry, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
+    tells_action: bool = True
 
     def __post_init__(self) -> None:
         following = 0
@@ -117,6 +120,11 @@ class Manifest:
             if entry.first_block < following:
                 raise ValueError(f"shard {entry.name}: its blocks overlap or are out of order")
             following = entry.first_block + entry.blocks
+
+    @property
+    def action_limits(self) -> tuple[float, ...]:
+        """What an action of 1 commands, [A] in the units of `action`."""
+        return self.action.limits
 
     @property
     def block_size(self) -> int:
@@ -151,6 +159,11 @@ class Manifest:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values, without the digest."""
         values = {name.name: getattr(self, name.name) for name in dataclasses.fields(self)}
+        if not values.pop("tells_action"):
+            limits = {"action": ("action_limits", list(self.action_limits))}
+            values = dict(limits.get(name, (name, value)) for name, value in values.items())
+        else:
+            values["action"] = self.action.to_json()
         values["shards"] = [dataclasses.asdict(entry) for entry in self.shards]
         ordered = {"format_version": values.pop("format_version")} | values
         result: dict[str, Any] = json.loads(json.dumps(ordered, allow_nan=False))
@@ -209,9 +222,19 @@ class Manifest:
         Raises:
             KeyError, TypeError, ValueError: the values are not those of a manifest.
         """
-        shards = tuple(ShardEntry(**{**entry, "seeds": tuple(entry["seeds"])}) for entry in values["shards"])
-        tuples = {name: tuple(values[name]) for name in ("image_shape", "action_limits", "phi_range")}
-        return cls(**{**values, **tuples, "shards": shards})
+        values = dict(values)
+        tells_action = "action" in values
+        action = ActionSpace.from_json(values.pop("action")) if tells_action else grasping(values.pop("action_limits"))
+        shards = tuple(ShardEntry(**{**entry, "seeds": tuple(entry["seeds"])}) for entry in values.pop("shards"))
+        image_shape, phi_range = tuple(values.pop("image_shape")), values.pop("phi_range")
+        return cls(
+            **values,
+            image_shape=image_shape,
+            action=action,
+            phi_range=None if phi_range is None else tuple(phi_range),
+            shards=shards,
+            tells_action=tells_action,
+        )
 
     def with_shard(self, entry: ShardEntry) -> "Manifest":
         """Return the manifest with `entry` added; it takes the place of one that starts at the same block."""

@@ -1,4 +1,4 @@
-"""What training reads: blocks of one task, image shape, action limits and discount, from any number of datasets."""
+"""What training reads: blocks of one task, image shape, action space and discount, from any number of datasets."""
 
 import hashlib
 from collections.abc import Sequence
@@ -6,19 +6,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
 from graspq.datasets.blocks import BlockArrays, BlockRef, read_block, read_columns, relabelled
 
 
 @dataclass(frozen=True, eq=False)
 class ShardPool:
-    """Blocks of one or more datasets that agree in task, image shape, action limits and discount.
+    """Blocks of one or more datasets that agree in task, image shape, action space and discount.
 
     Attributes:
         blocks: ordered by seed of the dataset, then by number: the order in which they were named does not matter.
         task: the task's settings as JSON.
         image_shape: (H, W, C).
-        action_limits: what an action of 1 commands, (dx, dy, dz, dφ); metres and radians.
+        action: what an action means.
         discount: γ of `mc_return`: the stored one, or that of `with_discount`.
         object_set: `name` and `sha256` of the object set of the first dataset.
         manifest_digest: that of the manifest where the pool is one whole dataset, else that of the shards' digests.
@@ -27,12 +28,17 @@ class ShardPool:
     blocks: tuple[BlockRef, ...]
     task: dict[str, Any]
     image_shape: tuple[int, int, int]
-    action_limits: tuple[float, float, float, float]
+    action: ActionSpace
     discount: float
     object_set: dict[str, Any]
     manifest_digest: str
     _footers: dict[Path, Any] = field(default_factory=dict, repr=False)
     _relabels: bool = field(default=False, repr=False)
+
+    @property
+    def action_limits(self) -> tuple[float, ...]:
+        """What an action of 1 commands, [A] in the units of `action`."""
+        return self.action.limits
 
     @property
     def rows(self) -> int:

@@ -10,7 +10,6 @@ import pyarrow as pa
 
 from graspq.datasets.manifest import Manifest
 
-POSE = 4
 OBJECT_POSE = 7
 COMPRESSION_LEVEL = 6
 
@@ -22,18 +21,19 @@ def steps_schema(manifest: Manifest) -> pa.Schema:
     """
     height, width, channels = manifest.image_shape
     image = {"shape": [height, width, channels], "dtype": "uint8", "layout": "H W C", "color": "RGB"}
-    unit = {"order": ["dx", "dy", "dz", "dphi"], "unit": "action_limits", "action_limits": list(manifest.action_limits)}
-    pose = {"order": ["x", "y", "z", "phi"], "unit": ["m", "m", "m", "rad"], "phi_range": list(manifest.phi_range)}
+    action, size = manifest.action, manifest.action.size
+    unit = {"order": list(action.names), "unit": "action_limits", "action_limits": list(action.limits)}
+    pose = {"order": list(action.pose), "unit": list(action.units), **_phi_range(manifest)}
     fields = [
         _field("episode_id", pa.int64()),
         _field("step", pa.int32()),
         _field("image", pa.binary(height * width * channels), image),
-        _field("action", _vector(POSE), unit),
+        _field("action", _vector(size), unit),
         _field("reward", pa.float32()),
         _field("terminal", pa.bool_()),
-        _field("gripper_pose", _vector(POSE), pose),
+        _field("gripper_pose", _vector(size), pose),
         _field("mc_return", pa.float32(), {"discount": manifest.discount}),
-        _field("synthetic_action", _vector(POSE), unit),
+        _field("synthetic_action", _vector(size), unit),
     ]
     return pa.schema(fields, metadata=_table_metadata(manifest, "steps"))
 
@@ -41,7 +41,7 @@ def steps_schema(manifest: Manifest) -> pa.Schema:
 def episodes_schema(manifest: Manifest) -> pa.Schema:
     """Return the schema of the episodes table: one row per episode."""
     poses = {"order": ["x", "y", "z", "qx", "qy", "qz", "qw"], "unit": "m, unit quaternion"}
-    final = {"order": ["x", "y", "z", "phi"], "unit": ["m", "m", "m", "rad"]}
+    final = {"order": list(manifest.action.pose), "unit": list(manifest.action.units)}
     fields = [
         _field("episode_id", pa.int64()),
         _field("block", pa.int64()),
@@ -54,7 +54,7 @@ def episodes_schema(manifest: Manifest) -> pa.Schema:
         pa.field("lifted_object", pa.string()),
         _field("policy", pa.string()),
         _field("exploration", pa.float64()),
-        _field("final_pose", _vector(POSE), final),
+        _field("final_pose", _vector(manifest.action.size), final),
     ]
     return pa.schema(fields, metadata=_table_metadata(manifest, "episodes"))
 
@@ -89,5 +89,9 @@ def _table_metadata(manifest: Manifest, table: str) -> dict[str, str]:
         "graspq.image_shape": json.dumps(list(manifest.image_shape)),
         "graspq.action_limits": json.dumps(list(manifest.action_limits)),
         "graspq.discount": json.dumps(manifest.discount),
-        "graspq.phi_range": json.dumps(list(manifest.phi_range)),
+        **{f"graspq.{name}": json.dumps(value) for name, value in _phi_range(manifest).items()},
     }
+
+
+def _phi_range(manifest: Manifest) -> dict[str, list[float]]:
+    return {} if manifest.phi_range is None else {"phi_range": list(manifest.phi_range)}

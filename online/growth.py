@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from graspq.common.action_space import grasping
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
 from graspq.common.machine import available_cores
@@ -168,7 +169,7 @@ def _description(
         versions=versions(*VERSIONS, "torch"),
         object_set={"name": objects.name, "sha256": objects.digest()},
         image_shape=(task.image_size, task.image_size, 3),
-        action_limits=task.action_limits,
+        action=grasping(task.action_limits),
         discount=discount,
         phi_range=(-task.phi_limit, task.phi_limit),
     )

@@ -34,6 +34,7 @@ def collect_regular() -> Callable[[Path, ObjectSet, int, int], Path]:
 
     def collect(folder: Path, objects: ObjectSet, blocks: int, block_size: int) -> Path:
         # Here, and not above: most tests need no simulator.
+        from graspq.common.action_space import grasping
         from graspq.datagen.collect import collect_block
         from graspq.datagen.settings import CollectionSettings
         from graspq.datasets.manifest import Manifest
@@ -48,7 +49,7 @@ def collect_regular() -> Callable[[Path, ObjectSet, int, int], Path]:
             versions={},
             object_set={"name": objects.name, "sha256": objects.digest()},
             image_shape=(task.image_size, task.image_size, 3),
-            action_limits=task.action_limits,
+            action=grasping(task.action_limits),
             discount=1.0,
             phi_range=(-task.phi_limit, task.phi_limit),
         )

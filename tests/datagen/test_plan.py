@@ -1,3 +1,4 @@
+from graspq.common.action_space import grasping
 from graspq.datagen.plan import human_bytes, human_time, missing_shards, plan_shards
 from graspq.datagen.settings import CollectionSettings, DatagenSettings
 from graspq.datasets.manifest import Manifest
@@ -8,7 +9,7 @@ SETTINGS = CollectionSettings(block_size=20, blocks_per_shard=5)
 def empty_manifest():
     return Manifest(
         task={"name": "regular"}, settings=SETTINGS.described(), versions={}, object_set={}, image_shape=(64, 64, 3),
-        action_limits=(0.06, 0.06, 0.06, 0.4), discount=1.0, phi_range=(-1.75, 1.75),
+        action=grasping((0.06, 0.06, 0.06, 0.4)), discount=1.0, phi_range=(-1.75, 1.75),
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graspq.common.action_space import grasping
 from graspq.common.files import sha256_of, write_json, write_text
 from graspq.common.seeding import generator
 from graspq.datasets.card import write_card
@@ -22,7 +23,7 @@ def make_manifest(size: int = 8, block_size: int = 2, discount: float = 1.0, tas
         versions={"graspq": "0"},
         object_set={"name": "drawn", "sha256": "0" * 64},
         image_shape=(size, size, 3),
-        action_limits=LIMITS,
+        action=grasping(LIMITS),
         discount=discount,
         phi_range=(-2.9, 2.9),
     )

@@ -4,6 +4,7 @@ import shutil
 import numpy as np
 import pytest
 
+from graspq.common.action_space import grasping
 from graspq.common.errors import UserError
 from graspq.datasets.dataset import Dataset, open_shards
 from graspq.datasets.labels import mc_return
@@ -111,7 +112,7 @@ def test_a_block_is_read_without_copying_its_images(dataset):
     ("what", "change"),
     [
         ("tasks", {"task": {"name": "targeted", "max_steps": 15}}),
-        ("action limits", {"action_limits": (0.1, 0.1, 0.1, 0.1)}),
+        ("action limits", {"action": grasping((0.1, 0.1, 0.1, 0.1))}),
         ("discounts", {"discount": 0.9}),
     ],
 )

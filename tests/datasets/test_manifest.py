@@ -90,3 +90,13 @@ def test_a_shard_cannot_name_files_elsewhere(dataset):
     entry = Manifest.load(dataset).shards[0]
     with pytest.raises(ValueError, match="expected the files"):
         dataclasses.replace(entry, files={"../../elsewhere": "0"})
+
+
+def test_a_manifest_of_before_keeps_its_digest_and_means_grasping_actions(dataset, tmp_path):
+    manifest = Manifest.load(dataset)
+    before = dataclasses.replace(manifest, tells_action=False)
+    before.save(tmp_path)
+    written = json.loads((tmp_path / "manifest.json").read_text())
+    assert written["action_limits"] == list(manifest.action_limits) and "action" not in written
+    opened = Manifest.load(tmp_path)
+    assert opened.action == manifest.action and opened.digest() == written["digest"] != manifest.digest()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from graspq.common.action_space import grasping
 from graspq.common.seeding import generator
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import Manifest
@@ -63,7 +64,7 @@ def make_dataset(folder: Path, blocks: int, discount: float = 1.0) -> Path:
         versions={"graspq": "0"},
         object_set={"name": "drawn", "sha256": "0" * 64},
         image_shape=(SIZE, SIZE, 3),
-        action_limits=(0.06, 0.06, 0.06, 0.4),
+        action=grasping((0.06, 0.06, 0.06, 0.4)),
         discount=discount,
         phi_range=(-2.9, 2.9),
     )
