@@ -68,8 +68,11 @@ class ActionSpace:
         Raises:
             UserError: it is none.
         """
+        parts: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+        }
         try:
-            return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+            return cls(**parts)
         except TypeError as error:
             raise UserError(f"action space {values!r}: not a description of an action ({error})") from None
 
