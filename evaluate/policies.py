@@ -17,9 +17,10 @@ from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
 from graspq.common.named_objects import named_module
 from graspq.common.seeding import generator
+from graspq.evaluate.records import ORACLE as ORACLE
+from graspq.evaluate.records import RANDOM as RANDOM
 from graspq.evaluate.settings import CemSettings, Device
 
-ORACLE, RANDOM = "oracle", "random"
 CEM, ACTOR = "cem", "actor"  # what eval.json calls the policies of runs
 ACTION_DIMENSIONS = 4
 _ROUNDING = 1e-5  # a float32 action may lie this far outside [-1, 1]

@@ -18,6 +18,7 @@ EVAL_FILE = "eval.json"
 EPISODES_FILE = "episodes.jsonl"
 FILMS_FILE = "films.npz"
 FORMAT_VERSION = 1
+ORACLE, RANDOM = "oracle", "random"  # the two ends of the scale, as eval.json calls them
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graspq.common.errors import UserError
-from graspq.evaluate.policies import ORACLE, RANDOM
-from graspq.evaluate.records import EVAL_FILE, EpisodeRow, Evaluation, find_evaluations, identity_digest
+from graspq.evaluate.records import EVAL_FILE, ORACLE, RANDOM, EpisodeRow, Evaluation, find_evaluations, identity_digest
 from graspq.evaluate.statistics import PairedDifference, paired_difference, wilson_interval
 from graspq.report.stability import Sweep, all_left_out, find_sweeps
 from graspq.train.run import Run

@@ -11,21 +11,14 @@ import jinja2
 import graspq
 from graspq.common.errors import UserError
 from graspq.common.files import write_text
-from graspq.evaluate.policies import ORACLE, RANDOM
+from graspq.evaluate.records import ORACLE, RANDOM
 from graspq.report.charts import PLOT
-from graspq.report.figures import calibration_charts, film_groups, learning_curves
+from graspq.report.curves import calibration_charts, learning_curves
+from graspq.report.film_strips import film_groups
 from graspq.report.findings import Findings, RunData, Score, gather
+from graspq.report.made_with import command_lines, settings_table, version_rows
 from graspq.report.stability import stability_of
-from graspq.report.tables import (
-    command_lines,
-    evaluation_row,
-    interval_text,
-    panel_of,
-    percent,
-    set_name,
-    settings_table,
-    version_rows,
-)
+from graspq.report.success import evaluation_row, interval_text, panel_of, percent, set_name
 
 PALETTE = 8  # colours of candidates; the two after them are the references'
 

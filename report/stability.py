@@ -1,19 +1,14 @@
-"""Sweeps in a report: how stable each estimator is over the settings and seeds that `grasp-sweep` tried.
+"""Sweeps in a report: how stable each estimator is over the settings and seeds that `grasp-sweep` tried."""
 
-The table of a sweep, `sweep.jsonl`, is all that is read: a row for each job with `id, algo, status, success_rate`.
-"""
-
-import json
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
+from graspq.evaluate.sweep_table import SWEEP_FILE, read_sweep_table
 from graspq.report.charts import LineChart, Series, line_chart
 
-SWEEP_FILE = "sweep.jsonl"
 MOST_DOTS = 40  # more runs than these are a line alone
 FEWEST_RANKS = 6  # so that ticks are whole ranks
 
@@ -61,17 +56,7 @@ def find_sweeps(folder: Path) -> list[Sweep]:
     Raises:
         UserError: a table is not one of grasp-sweep.
     """
-    return [_read(path) for path in sorted(folder.rglob(SWEEP_FILE))]
-
-
-def _read(path: Path) -> Sweep:
-    try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        for row in rows:
-            row["id"], row["algo"], row["status"], row["steps"], row["success_rate"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: not a readable table of grasp-sweep ({error!r}); run grasp-sweep again") from None
-    return Sweep(path.parent, rows)
+    return [Sweep(path.parent, read_sweep_table(path)) for path in sorted(folder.rglob(SWEEP_FILE))]
 
 
 def stability_of(sweep: Sweep, colors: Mapping[str, int], palette: int) -> dict[str, Any] | None:

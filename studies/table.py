@@ -3,15 +3,12 @@
 It is made anew from the jobs' own files each time, never added to.
 """
 
-import csv
-import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from graspq.common.files import write_text
-from graspq.report.stability import SWEEP_FILE
+from graspq.common.text import markdown
+from graspq.evaluate.sweep_table import write_sweep_table
 from graspq.studies.state import State
 
 VARIED = ("algo", "learning_rate", "width", "discount", "exploration_steps", "seed")
@@ -19,7 +16,6 @@ COLUMNS = (
     "id", *VARIED, "status", "steps", "success_rate", "ci95_low", "ci95_high", "successes", "episodes",
     "training_seconds", "reason",
 )  # fmt: skip
-CSV_FILE = "sweep.csv"
 
 
 def row_of(state: State) -> dict[str, Any]:
@@ -36,13 +32,7 @@ def row_of(state: State) -> dict[str, Any]:
 
 def write_tables(folder: Path, states: Sequence[State]) -> None:
     """Write `sweep.jsonl` and `sweep.csv`, each atomically."""
-    rows = [row_of(state) for state in states]
-    write_text(folder / SWEEP_FILE, "".join(json.dumps(row) + "\n" for row in rows))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(folder / CSV_FILE, text.getvalue())
+    write_sweep_table(folder, COLUMNS, [row_of(state) for state in states])
 
 
 def as_markdown(states: Sequence[State]) -> str:
@@ -54,9 +44,7 @@ def as_markdown(states: Sequence[State]) -> str:
     rows = sorted((row_of(state) for state in states), key=lambda row: (order[row["algo"]], *_rank(row)))
     varied = [name for name in VARIED if any(row[name] is not None for row in rows)]
     heads = [name.replace("_", " ") for name in varied] + ["success", "95 % interval", "steps", "training", "status"]
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    lines += ["| " + " | ".join([*(_text(row[name]) for name in varied), *_outcome(row)]) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+    return markdown(heads, [[*(_text(row[name]) for name in varied), *_outcome(row)] for row in rows])
 
 
 def _rank(row: dict[str, Any]) -> tuple[int, float]:
@@ -78,7 +66,7 @@ def _outcome(row: dict[str, Any]) -> list[str]:
         f"{row['ci95_low']:.3f} to {row['ci95_high']:.3f}" if done else "",
         f"{row['steps']:,}",
         f"{seconds:,.0f} s" if seconds is not None else "",
-        "failed: " + row["reason"].replace("|", "\\|") if row["status"] == "failed" else row["status"],
+        "failed: " + row["reason"] if row["status"] == "failed" else row["status"],
     ]
 
 

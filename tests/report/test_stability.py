@@ -85,5 +85,5 @@ def test_a_page_on_a_sweep_shows_the_figure_and_of_its_runs_the_best_of_each_est
 
 def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "sweep.jsonl").write_text('{"id": "x"}\n')
-    with pytest.raises(UserError, match=r"sweep\.jsonl: not a readable table of grasp-sweep"):
+    with pytest.raises(UserError, match=r"sweep\.jsonl: not the table of a sweep"):
         find_sweeps(tmp_path)

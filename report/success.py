@@ -1,19 +1,12 @@
-"""The tables of a report, and its bars: success, differences, seeds, evaluations, settings, commands, versions.
-
-Each function turns findings into the words and numbers that the template sets.
-"""
+"""Success rates in words and numbers: a panel's bars, differences and means over seeds; the table of evaluations."""
 
 import json
-import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from graspq.common.errors import UserError
-from graspq.common.options import flag
-from graspq.evaluate.policies import ORACLE, RANDOM
-from graspq.evaluate.records import Evaluation
+from graspq.evaluate.records import ORACLE, RANDOM, Evaluation
 from graspq.evaluate.statistics import mean_over_seeds
-from graspq.report.findings import Findings, RunData, Scenes, Score, comparisons
+from graspq.report.findings import RunData, Scenes, Score, comparisons
 
 REFERENCE_COLORS = {RANDOM: 8, ORACLE: 9}
 PER_RUN = ("seed", "out")  # settings in which runs of one experiment may differ
@@ -117,59 +110,3 @@ def evaluation_row(score: Score, one: Evaluation) -> dict[str, Any]:
         "checkpoint": f"{checkpoint:,}" if checkpoint is not None else "–",
         "objects": f"{set_name(summary)} {summary.get('object_set', {}).get('sha256', '')[:8]}",
     }
-
-
-def settings_table(runs: Sequence[RunData]) -> dict[str, Any]:
-    """Return the settings of runs side by side, those that differ first."""
-    names = list(dict.fromkeys(name for run in runs for name in run.settings))
-    rows = []
-    for name in names:
-        cells = [_value(run.settings.get(name)) for run in runs]
-        rows.append({"name": name, "cells": cells, "differs": len(set(cells)) > 1})
-    return {"names": [run.name for run in runs], "rows": sorted(rows, key=lambda row: not row["differs"])}
-
-
-def _value(value: Any) -> str:
-    if value is None:
-        return "–"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def command_lines(findings: Findings) -> list[str]:
-    """Return the commands that made the runs and evaluations."""
-    commands = [train_command(run) for run in findings.runs]
-    commands += [one.summary["command"] for one in findings.evaluations if "command" in one.summary]
-    return list(dict.fromkeys(commands))
-
-
-def train_command(run: RunData) -> str:
-    """Return the command line that makes a run again; settings at their preset's values are left out."""
-    from graspq.train.settings import preset_settings
-
-    given = run.settings
-    try:
-        usual = preset_settings(given["preset"], algo=given["algo"], shards=tuple(given["shards"])).to_json()
-    except (KeyError, TypeError, UserError):
-        return str(run.config.get("command", "grasp-train"))
-    words = ["grasp-train", "--algo", given["algo"], "--shards", *given["shards"]]
-    for name, value in given.items():
-        if name in ("algo", "shards") or (name in usual and value == usual[name]):
-            continue
-        if isinstance(value, bool):
-            words.append(flag(name) if value else f"--no-{flag(name)[2:]}")
-        elif value is not None:
-            words += [flag(name), str(value)]
-    return shlex.join(words)
-
-
-def version_rows(findings: Findings) -> list[tuple[str, str]]:
-    """Return package → versions over all runs and evaluations, code revisions last."""
-    found: dict[str, dict[str, None]] = {}
-    sources = [*(run.config for run in findings.runs), *(one.summary for one in findings.evaluations)]
-    for source in sources:
-        for name, version in (source.get("versions") or {}).items():
-            found.setdefault(name, {})[str(version)] = None
-    for source in sources:
-        if source.get("code_revision"):
-            found.setdefault("code revision", {})[str(source["code_revision"])] = None
-    return [(name, ", ".join(values)) for name, values in found.items()]

@@ -1,17 +1,7 @@
-"""The figures of a report: learning curves, calibration, film strips.
+"""The curves of a report, of learning and of calibration: what was found as charts that the template draws."""
 
-Each function turns findings into what the template draws.
-"""
-
-import base64
-import io
 from collections.abc import Iterable, Sequence
-from typing import Any
 
-import numpy as np
-from PIL import Image
-
-from graspq.evaluate.films import Film, read_films
 from graspq.report.charts import LineChart, Series, line_chart, thinned
 from graspq.report.findings import Findings, RunData, calibration_of
 
@@ -72,43 +62,3 @@ def _calibration_chart(title: str, x_label: str, series: Sequence[Series]) -> Li
         y_range=(0.0, 1.0),
         diagonal=True,
     )
-
-
-def film_groups(findings: Findings) -> list[dict[str, Any]]:
-    """Return the film strips, grouped by policy; those of candidates stand open."""
-    groups = []
-    for (task, split, *_), scores in findings.panels.items():
-        for score in sorted(scores, key=lambda score: (score.is_reference, -score.rate)):
-            films = read_films(score.evaluations[0])
-            if films:
-                drawn = [_film(film) for film in films]
-                scenes = f"{task} task, {split} split"
-                groups.append({"name": score.name, "scenes": scenes, "films": drawn, "open": not score.is_reference})
-    return groups
-
-
-def _film(film: Film) -> dict[str, Any]:
-    row = film.row
-    what = f"lifted {row.lifted_object}" if row.lifted_object is not None else "lifted nothing"
-    how = "after coming down" if row.end == "height" else "at the last step"
-    q = f", Q {row.q:.2f}" if row.q is not None else ""
-    actions = f"{row.steps} action{'s' if row.steps != 1 else ''}"
-    frames = []
-    for index, frame in enumerate(film.frames):
-        last = index == len(film.frames) - 1
-        caption = "after the lift" if last else f"t = {index}"
-        alt = "Bin after the lift" if last else f"Bin before action {index + 1}"
-        height, width = frame.shape[:2]
-        frames.append({"png": _png(frame), "alt": alt, "caption": caption, "width": width, "height": height})
-    return {
-        "success": row.success,
-        "caption": f"episode {row.episode}: {what}, closed {how}, {actions}{q}",
-        "frames": frames,
-    }
-
-
-def _png(frame: np.ndarray) -> str:
-    """Return uint8 [H, W, 3] as a PNG in base64."""
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", optimize=True)
-    return base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,65 @@
+"""What the runs of a report were made with: their settings side by side, commands, versions."""
+
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.options import flag
+from graspq.report.findings import Findings, RunData
+
+
+def settings_table(runs: Sequence[RunData]) -> dict[str, Any]:
+    """Return the settings of runs side by side, those that differ first."""
+    names = list(dict.fromkeys(name for run in runs for name in run.settings))
+    rows = []
+    for name in names:
+        cells = [_value(run.settings.get(name)) for run in runs]
+        rows.append({"name": name, "cells": cells, "differs": len(set(cells)) > 1})
+    return {"names": [run.name for run in runs], "rows": sorted(rows, key=lambda row: not row["differs"])}
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return "–"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def command_lines(findings: Findings) -> list[str]:
+    """Return the commands that made the runs and evaluations."""
+    commands = [train_command(run) for run in findings.runs]
+    commands += [one.summary["command"] for one in findings.evaluations if "command" in one.summary]
+    return list(dict.fromkeys(commands))
+
+
+def train_command(run: RunData) -> str:
+    """Return the command line that makes a run again; settings at their preset's values are left out."""
+    from graspq.train.settings import preset_settings
+
+    given = run.settings
+    try:
+        usual = preset_settings(given["preset"], algo=given["algo"], shards=tuple(given["shards"])).to_json()
+    except (KeyError, TypeError, UserError):
+        return str(run.config.get("command", "grasp-train"))
+    words = ["grasp-train", "--algo", given["algo"], "--shards", *given["shards"]]
+    for name, value in given.items():
+        if name in ("algo", "shards") or (name in usual and value == usual[name]):
+            continue
+        if isinstance(value, bool):
+            words.append(flag(name) if value else f"--no-{flag(name)[2:]}")
+        elif value is not None:
+            words += [flag(name), str(value)]
+    return shlex.join(words)
+
+
+def version_rows(findings: Findings) -> list[tuple[str, str]]:
+    """Return package → versions over all runs and evaluations, code revisions last."""
+    found: dict[str, dict[str, None]] = {}
+    sources = [*(run.config for run in findings.runs), *(one.summary for one in findings.evaluations)]
+    for source in sources:
+        for name, version in (source.get("versions") or {}).items():
+            found.setdefault(name, {})[str(version)] = None
+    for source in sources:
+        if source.get("code_revision"):
+            found.setdefault("code revision", {})[str(source["code_revision"])] = None
+    return [(name, ", ".join(values)) for name, values in found.items()]
