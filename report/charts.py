@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 WIDTH, HEIGHT = 480, 300
-LEFT, RIGHT, TOP, BOTTOM = 52, 22, 14, 46
+LEFT, RIGHT, TOP, BOTTOM = 62, 22, 14, 46
 MOST_POINTS = 240
 PLOT = {"left": LEFT, "right": WIDTH - RIGHT, "top": TOP, "bottom": HEIGHT - BOTTOM}  # where curves are drawn
 
@@ -117,8 +117,8 @@ def line_chart(
         description,
         x_label,
         y_label,
-        [(place(tick, low_y)[0], tick_label(tick)) for tick in x_ticks],
-        [(place(low_x, tick)[1], tick_label(tick)) for tick in y_ticks if low_y <= tick <= high_y],
+        [(place(tick, low_y)[0], label) for tick, label in labelled(x_ticks)],
+        [(place(low_x, tick)[1], label) for tick, label in labelled(y_ticks) if low_y <= tick <= high_y],
         drawn,
         (*place(low_x, low_x), *place(high_x, high_x)) if diagonal else None,
     )
@@ -141,11 +141,12 @@ def nice_ticks(low: float, high: float, count: int) -> list[float]:
     return [round(index * step, 12) for index in range(first, last + 1)]
 
 
-def tick_label(value: float) -> str:
-    """Return a short label: 20000 is `20k`."""
-    if abs(value) >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"
+def labelled(ticks: Sequence[float]) -> list[tuple[float, str]]:
+    """Return ticks with short labels of equally many decimals: `0.5`, `1.0`; 20000 is `20k`."""
+    greatest = max(map(abs, ticks), default=0.0)
+    unit, suffix = (1e6, "M") if greatest >= 1e6 else (1e3, "k") if greatest >= 1e4 else (1.0, "")
+    decimals = max((len(f"{tick / unit:g}".partition(".")[2]) for tick in ticks), default=0)
+    return [(tick, f"{tick / unit:.{decimals}f}{suffix}" if tick != 0 else "0") for tick in ticks]
 
 
 def _span(values: Sequence[float]) -> tuple[float, float]:

@@ -31,11 +31,11 @@ def _ends(what: str, series: Iterable[Series]) -> str:
 def calibration_charts(findings: Findings, colors: dict[str, int]) -> list[LineChart]:
     """Return the charts of calibration: on held-back data, and on each panel's own grasps."""
     held_back = [_calibration_series(run.name, colors[run.name], _validation_bins(run)) for run in findings.runs]
-    charts = [_calibration_chart("Held-back data", "estimated Q of the logged last action", held_back)]
+    charts = [_calibration_chart("Held-back training data", "Q of the logged last action", held_back)]
     for (task, split, *_), scores in findings.panels.items():
         candidates = [score for score in scores if not score.is_reference]
         series = [_calibration_series(one.name, colors[one.name], calibration_of(one.rows)) for one in candidates]
-        charts.append(_calibration_chart(f"Own grasps, {task} {split}", "Q of the chosen last action", series))
+        charts.append(_calibration_chart(f"Evaluation, {task} task, {split} split", "Q of the last action", series))
     return [chart for chart in charts if chart is not None]
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from graspq.common.text import counted
 from graspq.evaluate.films import Film, read_films
 from graspq.report.findings import Findings
 
@@ -27,9 +28,8 @@ def film_groups(findings: Findings) -> list[dict[str, Any]]:
 def _film(film: Film) -> dict[str, Any]:
     row = film.row
     what = f"lifted {row.lifted_object}" if row.lifted_object is not None else "lifted nothing"
-    how = "after coming down" if row.end == "height" else "at the last step"
+    where = "near the floor" if row.end == "height" else "at the last step"
     q = f", Q {row.q:.2f}" if row.q is not None else ""
-    actions = f"{row.steps} action{'s' if row.steps != 1 else ''}"
     frames = []
     for index, frame in enumerate(film.frames):
         last = index == len(film.frames) - 1
@@ -39,7 +39,7 @@ def _film(film: Film) -> dict[str, Any]:
         frames.append({"png": _png(frame), "alt": alt, "caption": caption, "width": width, "height": height})
     return {
         "success": row.success,
-        "caption": f"episode {row.episode}: {what}, closed {how}, {actions}{q}",
+        "caption": f"episode {row.episode}: closed {where} after {counted(row.steps, 'action')}{q}; {what}",
         "frames": frames,
     }
 

@@ -9,20 +9,28 @@ from graspq.common.options import flag
 from graspq.report.findings import Findings, RunData
 
 
-def settings_table(runs: Sequence[RunData]) -> dict[str, Any]:
-    """Return the settings of runs side by side, those that differ first."""
-    names = list(dict.fromkeys(name for run in runs for name in run.settings))
-    rows = []
-    for name in names:
-        cells = [_value(run.settings.get(name)) for run in runs]
-        rows.append({"name": name, "cells": cells, "differs": len(set(cells)) > 1})
-    return {"names": [run.name for run in runs], "rows": sorted(rows, key=lambda row: not row["differs"])}
+def settings_tables(runs: Sequence[RunData]) -> dict[str, Any]:
+    """Return the settings of runs side by side: those that differ, and those that all share with one value."""
+    given = [_flat(run.settings) for run in runs]
+    names = list(dict.fromkeys(name for one in given for name in one))
+    rows = [(name, [one.get(name, "–") for one in given]) for name in names]
+    return {
+        "names": [run.name for run in runs],
+        "differing": [row for row in rows if len(set(row[1])) > 1],
+        "shared": [(name, cells[0]) for name, cells in rows if len(set(cells)) == 1],
+    }
 
 
-def _value(value: Any) -> str:
-    if value is None:
-        return "–"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return names and values as text; settings within settings are named `outer.inner`."""
+    found: dict[str, str] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{name}.")
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            found[prefix + name] = "–" if value is None else text
+    return found
 
 
 def command_lines(findings: Findings) -> list[str]:

@@ -19,7 +19,7 @@ def percent(rate: float, digits: int = 1) -> str:
 
 def interval_text(low: float, high: float) -> str:
     """Return an interval of rates in percent."""
-    return f"{100 * low:.1f} – {100 * high:.1f}"
+    return f"{100 * low:.1f}\N{NO-BREAK SPACE}–\N{NO-BREAK SPACE}{100 * high:.1f}"
 
 
 def set_name(summary: dict[str, Any]) -> str:
@@ -81,7 +81,7 @@ def _seed_means(scores: Sequence[Score], runs: Sequence[RunData]) -> list[dict[s
             groups.setdefault(json.dumps(shared, sort_keys=True, default=str), []).append(score)
     rows = []
     for group in groups.values():
-        if len(group) < 2:
+        if len({settings[score.name].get("seed") for score in group}) < len(group) or len(group) < 2:
             continue
         mean = mean_over_seeds([score.rate for score in group])
         interval = interval_text(mean.low, mean.high) if mean.low is not None and mean.high is not None else "–"
@@ -101,12 +101,10 @@ def evaluation_row(score: Score, one: Evaluation) -> dict[str, Any]:
         "task": summary["task"],
         "split": summary["split"],
         "seed": summary["seed"],
-        "episodes": f"{summary['episodes']:,}",
-        "successes": f"{summary['successes']:,}",
+        "successes": f"{summary['successes']:,} of {summary['episodes']:,}",
         "rate": percent(summary["success_rate"]),
         "interval": interval_text(*summary["ci95"]),
         "steps": f"{summary['mean_steps']:.2f}",
         "height": percent(ends.get("height", 0) / summary["episodes"], 0),
         "checkpoint": f"{checkpoint:,}" if checkpoint is not None else "–",
-        "objects": f"{set_name(summary)} {summary.get('object_set', {}).get('sha256', '')[:8]}",
     }

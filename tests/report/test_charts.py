@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from graspq.report.charts import PLOT, Series, line_chart, nice_ticks, thinned, tick_label
+from graspq.report.charts import PLOT, Series, labelled, line_chart, nice_ticks, thinned
 
 
 @pytest.mark.parametrize(
@@ -20,8 +20,20 @@ def test_ticks_are_round_and_enclose_the_range(low: float, high: float, expected
     assert nice_ticks(low, high, 6) == pytest.approx(expected)
 
 
-def test_tick_labels_are_short() -> None:
-    assert [tick_label(value) for value in (0, 0.2, 1500, 20_000, 1_500_000)] == ["0", "0.2", "1500", "20k", "1.5M"]
+@pytest.mark.parametrize(
+    ("ticks", "labels"),
+    [
+        ((0, 0.5, 1.0), ["0", "0.5", "1.0"]),
+        ((0.48, 0.5), ["0.48", "0.50"]),
+        ((0, 1500), ["0", "1500"]),
+        ((0, 5000, 10_000), ["0", "5k", "10k"]),
+        ((500_000, 1_500_000), ["0.5M", "1.5M"]),
+    ],
+)
+def test_the_labels_of_an_axis_are_short_and_have_equally_many_decimals(
+    ticks: tuple[float, ...], labels: list[str]
+) -> None:
+    assert labelled(ticks) == list(zip(ticks, labels, strict=True))
 
 
 def test_corners_of_the_data_are_corners_of_the_plot() -> None:

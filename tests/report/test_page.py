@@ -106,7 +106,9 @@ def test_a_page_with_everything_is_self_contained_and_says_what_was_measured(sco
     checker = checked(page)
     rates = {}
     for label in checker.labels:
-        match = re.match(r"(\w+): ([\d.]+)\N{NO-BREAK SPACE}%, 95 % interval ([\d.]+) – ([\d.]+), 200 episodes", label)
+        match = re.match(
+            r"(\w+): ([\d.]+)\N{NO-BREAK SPACE}%, 95 % interval ([\d.]+)\s–\s([\d.]+), 200 episodes", label
+        )
         if match is not None:
             rates[match[1]] = tuple(map(float, match.groups()[1:]))
     hard = np.random.default_rng(0).random(200)
@@ -115,12 +117,27 @@ def test_a_page_with_everything_is_self_contained_and_says_what_was_measured(sco
         count = int((hard < rate).sum())
         expected = [count / 200, *wilson_interval(count, 200)]
         assert rates[name] == pytest.approx([100 * value for value in expected], abs=0.051)
-    assert "mc succeeds in" in page and "of held-out grasps" in page
+    assert "mc succeeds in" in page and "of grasps of unseen objects" in page
     assert len(checker.images) == 2 * 2 * 3 and all(image["alt"] for image in checker.images)
     for section in ("success", "learning", "calibration", "films", "evaluations", "settings", "commands"):
         assert f'<section id="{section}">' in page
     assert "prefers-color-scheme:dark" in page and 'name="viewport"' in page
     assert "grasp-train --algo mc --shards" in page and "--batch-size 8" in page
+
+
+def test_a_best_of_several_says_on_which_split_it_was_selected(scored: Path) -> None:
+    said = "Best of 2 candidates: selected by success on these very scenes of the test split"
+    assert said in render(gather([scored / "runs"], scored / "baselines"))
+    assert "selected by" not in render(gather([scored / "runs" / "mc"], scored / "baselines"))
+
+
+def test_runs_are_averaged_over_seeds_only_where_their_seeds_differ(scored: Path) -> None:
+    for seed in (0, 1):
+        path = scored / "runs" / "dql" / "config.json"
+        config = json.loads(path.read_text())
+        config["settings"] |= {"algo": "mc", "seed": seed}
+        path.write_text(json.dumps(config))
+        assert ("Means over training seeds" in render(gather([scored / "runs"], None))) == (seed == 1)
 
 
 def test_a_run_that_was_never_evaluated_has_a_page_too(run_folder: Path) -> None:
