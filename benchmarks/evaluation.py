@@ -41,11 +41,12 @@ def one_at_a_time(
     """A player's part: one environment, one state a decision, asked for in the way that the message names."""
     from graspq.objects.object_set import ObjectSet
     from graspq.sim.episode import GraspSimulation
+    from graspq.sim.task import task_from_json
 
     torch.set_num_threads(threads)
     policy = searching(prepare(jobs_from_settings(settings)[0], settings))
     objects = ObjectSet.load(Path(stage.objects))
-    with GraspSimulation(stage.task, objects) as simulation:
+    with GraspSimulation(task_from_json(stage.task), objects) as simulation:
         way = yield None
         while True:
             acting = asking(policy, way)

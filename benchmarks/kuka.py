@@ -59,7 +59,7 @@ def make_environment() -> Any:
 
 def collecting(seed: int, grasps: int) -> Iterator[Tally | None]:
     """A player's part: `grasps` random grasps at a time, every frame kept as uint8, nothing written."""
-    from graspq.sim.policies import RandomPolicy
+    from graspq.policies.random import RandomPolicy
 
     # Its two sources of randomness are global.
     random.seed(seed)
@@ -71,7 +71,7 @@ def collecting(seed: int, grasps: int) -> Iterator[Tally | None]:
         for _ in range(grasps):
             frames, done, debug = [np.asarray(environment.reset(), dtype=np.uint8)], False, {}
             while not done:
-                image, _, done, debug = environment.step(policy.act(draws))
+                image, _, done, debug = environment.step(policy.act(None, draws))
                 frames.append(np.asarray(image, dtype=np.uint8))
             actions += len(frames) - 1
             successes += int(debug["grasp_success"] > 0)

@@ -21,9 +21,9 @@ from graspq.datasets.manifest import Manifest
 from graspq.objects.object_set import ObjectSet
 from graspq.sim import camera, cell, episode, kinematics
 from graspq.sim.bullet import bullet
-from graspq.sim.task import task_settings
+from graspq.sim.task import TASKS
 
-TASK = task_settings("regular")
+TASK = TASKS["regular"]
 
 
 class Shards:

@@ -1,12 +1,18 @@
-"""Objects that a user names as `module:name`: their own policies and estimators.
+"""Objects that a user names as `module:name`: their own policies, tasks and estimators.
 
 The module may lie in the working folder.
 """
 
 import importlib
+import os
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.files import sha256_of
 
 
 def named_module(name: str) -> ModuleType:
@@ -18,3 +24,38 @@ def named_module(name: str) -> ModuleType:
         return importlib.import_module(name)
     finally:
         sys.path.remove(here)
+
+
+def named_object(name: str, what: str) -> Any:
+    """Return what `module:name` stands for.
+
+    Args:
+        name: of the module and, after a colon, of something in it.
+        what: kind of the object, for the messages, such as `"policy"`.
+
+    Raises:
+        UserError: the name has no colon, the module cannot be imported, or has nothing of that name.
+    """
+    module_name, _, attribute = name.partition(":")
+    if not module_name or not attribute:
+        raise UserError(f"{what} {name!r}: expected module:name of your own")
+    try:
+        module = named_module(module_name)
+    except Exception as error:
+        raise UserError(f"{what} {name}: cannot be imported, {described(error)}") from error
+    if not hasattr(module, attribute):
+        raise UserError(f"{what} {name}: {module_name} has no {attribute!r}")
+    return getattr(module, attribute)
+
+
+def source_digest(name: str) -> str | None:
+    """Return the SHA-256 of the source file of an imported `module:name`; None where it has none."""
+    source = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
+    return sha256_of(Path(source)) if source is not None and Path(source).is_file() else None
+
+
+def described(error: Exception) -> str:
+    """Return an error with the place it was raised at, in one line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" at {os.path.relpath(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
+    return " ".join(f"{type(error).__name__}: {error}{where}".split())

@@ -11,7 +11,6 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from graspq.common.action_space import grasping
 from graspq.common.errors import UserError
 from graspq.common.files import TEMPORARY_PREFIX, writable_folder
 from graspq.common.machine import available_cores
@@ -34,7 +33,7 @@ from graspq.datasets.manifest import MANIFEST_NAME, Manifest
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
-from graspq.sim.task import TaskSettings, draw_objects, task_settings
+from graspq.sim.task import Task, task_named
 
 VERSIONS = ("numpy", "scipy", "pybullet", "pyarrow", "trimesh")
 
@@ -45,11 +44,11 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     Raises:
         UserError: the folder holds something else, cannot be written to, or the disk is too small.
     """
-    folder, task = settings.folder(), task_settings(settings.task)
+    folder, task = settings.folder(), task_named(settings.task)
     _refuse_other_folder(folder)
     existing = Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else None
     _check_space(settings, folder, existing)
-    objects = _object_set(settings, folder, existing)
+    objects = _object_set(settings, task, folder, existing)
     fresh = describe(settings, task, objects)
     if existing is not None:
         _require_same(folder, existing, fresh)
@@ -76,27 +75,27 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     return manifest
 
 
-def describe(settings: DatagenSettings, task: TaskSettings, objects: ObjectSet) -> Manifest:
+def describe(settings: DatagenSettings, task: Task, objects: ObjectSet) -> Manifest:
     """Return the manifest of the dataset before its first shard."""
     return Manifest(
-        task=task.to_json(),
+        task=task.settings.to_json(),
         settings=settings.collection().described(),
         versions=versions(*VERSIONS),
         object_set={"name": objects.name, "sha256": objects.digest()},
-        image_shape=(task.image_size, task.image_size, 3),
-        action=grasping(task.action_limits),
+        image_shape=(task.settings.image_size, task.settings.image_size, 3),
+        action=task.action,
         discount=settings.discount,
-        phi_range=(-task.phi_limit, task.phi_limit),
+        phi_range=(-task.settings.phi_limit, task.settings.phi_limit),
     )
 
 
-def draw_check(task: TaskSettings, objects: ObjectSet, settings: DatagenSettings) -> None:
+def draw_check(task: Task, objects: ObjectSet, settings: DatagenSettings) -> None:
     """Fail now, not in a worker, where the object set cannot fill a bin.
 
     Raises:
-        UserError: see `draw_objects`.
+        UserError: see `Task.draw`.
     """
-    draw_objects(task, objects, settings.collection().split, np.random.default_rng(0))
+    task.draw(objects, settings.collection().split, np.random.default_rng(0))
 
 
 def _refuse_other_folder(folder: Path) -> None:
@@ -110,12 +109,12 @@ def _refuse_other_folder(folder: Path) -> None:
         raise UserError(f"{folder}: holds {foreign[0]!r} but no {MANIFEST_NAME}; choose an empty folder with --out")
 
 
-def _object_set(settings: DatagenSettings, folder: Path, existing: Manifest | None) -> ObjectSet:
+def _object_set(settings: DatagenSettings, task: Task, folder: Path, existing: Manifest | None) -> ObjectSet:
     if settings.objects is not None:
         return ObjectSet.load(settings.objects)
     if existing is not None and (folder / "objects" / "object_set.json").is_file():
         return ObjectSet.load(folder / "objects")
-    return default_object_set(settings.task)
+    return default_object_set(task.object_set)
 
 
 def _require_same(folder: Path, existing: Manifest, fresh: Manifest) -> None:
@@ -159,7 +158,7 @@ def _announce(settings: DatagenSettings, folder: Path, missing: list[ShardPlan],
 def _collect(
     settings: DatagenSettings,
     folder: Path,
-    task: TaskSettings,
+    task: Task,
     manifest: Manifest,
     missing: list[ShardPlan],
     workers: int,

@@ -2,10 +2,10 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from graspq.common.options import Settings, parse_count, setting
-from graspq.sim.policies import RandomPolicy
+from graspq.policies.random import RandomPolicy
 from graspq.sim.task import EPISODES_PER_BIN
 
 BLOCKS_PER_SHARD = 50
@@ -15,7 +15,7 @@ BLOCKS_PER_SHARD = 50
 class DatagenSettings(Settings):
     """Options of `grasp-datagen`."""
 
-    task: Literal["regular", "targeted"] = setting("regular", help="task to collect")
+    task: str = setting("regular", help="task to collect: regular, targeted, or your own as module:task")
     size: int = setting(
         10_000, help="number of grasps, such as 2500, 10k, 100k or 1M", parse=parse_count, metavar="COUNT", minimum=1
     )
@@ -32,7 +32,7 @@ class DatagenSettings(Settings):
 
     def folder(self) -> Path:
         """Return the dataset's folder."""
-        return self.out if self.out is not None else Path("data") / f"{self.task}-{_short(self.size)}"
+        return self.out if self.out is not None else Path("data") / f"{self.task.replace(':', '.')}-{_short(self.size)}"
 
     def collection(self) -> "CollectionSettings":
         """Return what determines the bytes."""

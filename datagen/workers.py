@@ -11,19 +11,21 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from typing import Any
 
 from graspq.common.errors import UserError
-from graspq.datagen.collect import CollectingPolicy, collect_block
+from graspq.datagen.collect import collect_block
 from graspq.datagen.settings import CollectionSettings
 from graspq.datasets.episode import Episode
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.episode import GraspSimulation
-from graspq.sim.task import TaskSettings
+from graspq.sim.play import Policy
+from graspq.sim.task import Task, task_from_json
 
 BLOCKS_PER_WORKER = 500
 _DEATHS_ALLOWED = 1
 
-PolicyMaker = Callable[[], CollectingPolicy]
+PolicyMaker = Callable[[], Policy]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,7 @@ class BlockJob:
     first_episode: int | None = None
 
 
-_Setup = tuple[TaskSettings, Path, CollectionSettings, PolicyMaker | None]
+_Setup = tuple[dict[str, Any], Path, CollectionSettings, PolicyMaker | None]
 
 
 @dataclasses.dataclass
@@ -48,7 +50,7 @@ class _Worker:
 
 def collect_blocks(
     jobs: Iterable[BlockJob],
-    task: TaskSettings,
+    task: Task,
     objects: Path,
     settings: CollectionSettings,
     workers: int,
@@ -74,7 +76,7 @@ def collect_blocks(
     waiting = deque(jobs)
     deaths: dict[int, int] = {}
     team: list[_Worker] = []
-    setup = (task, objects, settings, make_policy)
+    setup = (task.settings.to_json(), objects, settings, make_policy)
     try:
         while waiting or any(worker.job is not None for worker in team):
             _employ(team, waiting, workers, setup)
@@ -93,7 +95,7 @@ def collect_blocks(
 
 def _collect_here(
     jobs: Iterable[BlockJob],
-    task: TaskSettings,
+    task: Task,
     objects: Path,
     settings: CollectionSettings,
     make_policy: PolicyMaker | None,
@@ -170,7 +172,7 @@ def _dismiss(worker: _Worker) -> None:
 
 def _work(
     connection: Connection,
-    task: TaskSettings,
+    task: dict[str, Any],
     objects: Path,
     settings: CollectionSettings,
     make_policy: PolicyMaker | None,
@@ -180,7 +182,9 @@ def _work(
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        for finished in _collect_here(iter(connection.recv, None), task, objects, settings, make_policy):
+        for finished in _collect_here(
+            iter(connection.recv, None), task_from_json(task), objects, settings, make_policy
+        ):
             connection.send(finished[1])
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # the parent is gone or needs us no more

@@ -101,7 +101,7 @@ def plan_table(entries: Sequence[Entry]) -> str:
     rows = [("policy", "task", "split", "seed", "episodes", "object set", "")]
     for entry in entries:
         job, prepared = entry.job, entry.prepared
-        task = prepared.task.name if prepared is not None else job.task or "?"
+        task = prepared.task.settings.name if prepared is not None else job.task or "?"
         objects = prepared.objects.folder.as_posix() if prepared is not None else str(job.objects or "?")
         rows.append((job.label, task, job.split, str(job.seed), str(job.episodes), objects, entry.status))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]

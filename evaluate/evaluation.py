@@ -36,7 +36,7 @@ from graspq.evaluate.statistics import wilson_interval
 if TYPE_CHECKING:
     from graspq.evaluate.runs import RunFacts
     from graspq.objects.object_set import ObjectSet
-    from graspq.sim.task import TaskSettings
+    from graspq.sim.task import Task
 
 BASELINES = Path("runs/baselines")
 PACKAGES = ("numpy", "pybullet", "torch")
@@ -58,7 +58,7 @@ class Prepared:
     """
 
     job: Job
-    task: "TaskSettings"
+    task: "Task"
     objects: "ObjectSet"
     facts: "RunFacts | None"
     policy: Policy | None
@@ -80,15 +80,13 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
         UserError: PyBullet, the run, its checkpoint, the task, the object set, its split or the policy is not there.
     """
     _check_simulator()
-    from graspq.sim.task import draw_objects
-
     policy, facts = _policy(job, settings)
     task, objects = _scenes(job, facts, beside)
     _check_fit(job, facts, task)
-    draw_objects(task, objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
+    task.draw(objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
     identity = {
         "simulator": versions("pybullet", "numpy"),
-        "task": task.to_json(),
+        "task": task.settings.to_json(),
         "split": job.split,
         "seed": job.seed,
         "episodes": job.episodes,
@@ -99,7 +97,7 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
         "network": facts.network_sha256 if facts is not None else None,
         **(policy.identity() if policy is not None else {}),
     }
-    folder, finished = _place(job, task.name, settings.out, identity)
+    folder, finished = _place(job, task.settings.name, settings.out, identity)
     return Prepared(job, task, objects, facts, policy, identity, folder, finished)
 
 
@@ -121,39 +119,39 @@ def _policy(job: Job, settings: EvalSettings) -> "tuple[Policy | None, RunFacts 
     return RandomObservationPolicy() if job.policy == RANDOM else UserPolicy.load(job.policy), None
 
 
-def _scenes(job: Job, facts: "RunFacts | None", beside: Sequence[Prepared]) -> "tuple[TaskSettings, ObjectSet]":
+def _scenes(job: Job, facts: "RunFacts | None", beside: Sequence[Prepared]) -> "tuple[Task, ObjectSet]":
     """Return the task and the object set that a job's scenes are made of."""
-    from graspq.sim.task import TaskSettings, task_settings
+    from graspq.sim.task import task_from_json, task_named
 
     name = job.task or (str(facts.task["name"]) if facts is not None else _common_task(beside))
     if facts is not None and facts.task["name"] == name:
-        objects = find_object_set(name, job.objects, facts.object_set, facts.datasets)
-        return TaskSettings.from_json(facts.task), objects
-    same = [other for other in beside if other.facts is not None and other.task.name == name]
-    task = same[0].task if same and facts is None else task_settings(name)
-    return task, find_object_set(name, job.objects, None, (), [other.objects.folder for other in same])
+        task = task_from_json(facts.task)
+        return task, find_object_set(task, job.objects, facts.object_set, facts.datasets)
+    same = [other for other in beside if other.facts is not None and other.task.settings.name == name]
+    task = same[0].task if same and facts is None else task_named(name)
+    return task, find_object_set(task, job.objects, None, (), [other.objects.folder for other in same])
 
 
 def _common_task(beside: Sequence[Prepared]) -> str:
     """Return the task that the runs of a plan have in common; `regular` where there are none or several."""
-    names = {other.task.name for other in beside if other.facts is not None}
+    names = {other.task.settings.name for other in beside if other.facts is not None}
     return names.pop() if len(names) == 1 else "regular"
 
 
-def _check_fit(job: Job, facts: "RunFacts | None", task: "TaskSettings") -> None:
+def _check_fit(job: Job, facts: "RunFacts | None", task: "Task") -> None:
     """Refuse a network that was trained on other images or actions than the task's."""
     if facts is None:
         return
-    shape = (task.image_size, task.image_size, 3)
+    shape = (task.settings.image_size, task.settings.image_size, 3)
     pairs = (
         ("images", facts.image_shape, shape),
-        ("action limits", facts.action_limits, tuple(task.action_limits)),
-        ("steps", facts.steps, task.max_steps),
+        ("action limits", facts.action_limits, task.action.limits),
+        ("steps", facts.steps, task.settings.max_steps),
     )
     for what, run, here in pairs:
         if run != here:
             raise UserError(
-                f"{job.run}: trained with {what} {run}, the {task.name} task has {here}; name its own --task"
+                f"{job.run}: trained with {what} {run}, the {task.settings.name} task has {here}; name its own --task"
             )
 
 
@@ -241,7 +239,9 @@ def stage_of(prepared: Prepared) -> Any:
     from graspq.evaluate.workers import Stage
 
     job = prepared.job
-    return Stage(prepared.task, str(prepared.objects.folder), job.split, job.seed, job.policy == ORACLE)
+    return Stage(
+        prepared.task.settings.to_json(), str(prepared.objects.folder), job.split, job.seed, job.policy == ORACLE
+    )
 
 
 def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
@@ -251,7 +251,7 @@ def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
     return {
         "format_version": FORMAT_VERSION,
         "label": job.label,
-        "task": prepared.task.name,
+        "task": prepared.task.settings.name,
         "split": job.split,
         "episodes": len(rows),
         "successes": successes,

@@ -11,17 +11,18 @@ from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
+from graspq.sim.task import Task
 
 SET_FILE = "object_set.json"
 
 
 def find_object_set(
-    task: str, asked: Path | None, wanted: str | None, datasets: Iterable[Path] = (), others: Iterable[Path] = ()
+    task: Task, asked: Path | None, wanted: str | None, datasets: Iterable[Path] = (), others: Iterable[Path] = ()
 ) -> ObjectSet:
     """Return the object set of an evaluation, its files verified.
 
     Args:
-        task: name of the task.
+        task: of the evaluation.
         asked: the folder the user named, an object set or a dataset that holds one.
         wanted: SHA-256 of the set that the run's data were made with, if known.
         datasets: folders of the datasets that the run was trained on.
@@ -39,7 +40,7 @@ def find_object_set(
     for folder in candidates:
         if (folder / SET_FILE).is_file() and wanted in (None, sha256_of(folder / SET_FILE)):
             return _verified(folder)
-    own = default_object_set(task)
+    own = default_object_set(task.object_set)
     if wanted not in (None, own.digest()):
         raise UserError(
             f"{own.folder}: not the object set of the run's data ({wanted}); name one with --objects FOLDER"

@@ -121,7 +121,7 @@ class RandomObservationPolicy(Policy):
     """The random policy of the collection; it looks at nothing."""
 
     def __init__(self) -> None:
-        from graspq.sim.policies import RandomPolicy
+        from graspq.policies.random import RandomPolicy
 
         self._policy = RandomPolicy()
 
@@ -136,7 +136,7 @@ class RandomObservationPolicy(Policy):
         actions = np.zeros((len(steps), ACTION_DIMENSIONS), dtype=np.float32)
         for row, own in enumerate(generators):
             if own is not None:
-                actions[row] = self._policy.act(own)
+                actions[row] = self._policy.act(None, own)
         return Decision(actions, None)
 
     def identity(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from graspq.evaluate.actor_policy import ActorPolicy
 from graspq.evaluate.policies import Policy
 from graspq.evaluate.q_policy import QPolicy, SyntheticPolicy
 from graspq.evaluate.settings import CemSettings, Device
-from graspq.sim.task import TaskSettings
+from graspq.sim.task import task_from_json
 from graspq.train.checkpoint import STATE_FILE, LoadedRun, load_acting
 from graspq.train.estimators import estimator_named
 from graspq.train.networks import QNetwork
@@ -89,7 +89,7 @@ def _policy(loaded: LoadedRun, facts: RunFacts, cem: CemSettings, device: torch.
     if acting == "actor":
         return ActorPolicy(loaded.networks, device)
     if acting == "synthetic search":
-        task = TaskSettings.from_json(facts.task)
+        task = task_from_json(facts.task).settings
         return SyntheticPolicy(cast(QNetwork, loaded.networks["q"]), cem, device, loaded.extra, task)
     return QPolicy(cast(QNetwork, loaded.networks["q"]), cem, device)
 

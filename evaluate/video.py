@@ -79,7 +79,7 @@ def film_episode(
     Returns:
         uint8 [F, size, size, 3] frames, and whether the grasp succeeded.
     """
-    from graspq.sim.oracle import Oracle
+    from graspq.policies.oracle import Oracle
 
     seen = begin_episode(simulation, simulation.objects, stage.split, stage.seed, episode)
     rngs: list[np.random.Generator | None] = [None] * environments
@@ -88,13 +88,15 @@ def film_episode(
     images = np.zeros((environments, *seen.image.shape), dtype=np.uint8)
     steps = np.zeros(environments, dtype=np.int64)
     poses = np.zeros((environments, 4), dtype=np.float32)
+    if policy is None:
+        oracle.begin(simulation)
     with _Filming(simulation, size) as filming:
         filming.shoot(PAUSE)
         while True:
             images[row], steps[row] = seen.image, seen.step
             poses[row] = seen.gripper_pose
             if policy is None:
-                action = oracle.act(simulation)
+                action = oracle.act(seen, np.random.default_rng(0))
             else:
                 action = policy.decide(images, steps, rngs, poses).actions[row]
             outcome = simulation.step(action)
@@ -129,9 +131,10 @@ def write_video(
     with quiet_errors():
         from graspq.sim.episode import GraspSimulation
     from graspq.objects.object_set import ObjectSet
+    from graspq.sim.task import task_from_json
 
     reels, successes = [], []
-    with GraspSimulation(stage.task, ObjectSet.load(Path(stage.objects))) as simulation:
+    with GraspSimulation(task_from_json(stage.task), ObjectSet.load(Path(stage.objects))) as simulation:
         for episode in range(episodes):
             frames, success = film_episode(simulation, stage, policy, episode, environments, size)
             reels.append(frames)

@@ -21,9 +21,8 @@ from graspq.common.seeding import generator
 
 if TYPE_CHECKING:
     from graspq.objects.object_set import ObjectSet
+    from graspq.policies.oracle import Oracle
     from graspq.sim.episode import GraspSimulation, Observation
-    from graspq.sim.oracle import Oracle
-    from graspq.sim.task import TaskSettings
 
 SCENE_PURPOSE = "evaluate/scene"
 
@@ -33,14 +32,14 @@ class Stage:
     """All that determines an evaluation's scenes, with the index of the episode; and who acts in the worker.
 
     Attributes:
-        task: the task's settings.
+        task: the task's settings as JSON.
         objects: folder of the object set.
         split: split that objects are drawn from.
         seed: seed of the scenes.
         oracle: the scripted oracle acts, with the simulation at hand; else the parent sends actions.
     """
 
-    task: "TaskSettings"
+    task: dict[str, Any]
     objects: str
     split: str
     seed: int
@@ -111,10 +110,8 @@ def begin_episode(
     Raises:
         UserError: the object set lacks the split.
     """
-    from graspq.sim.task import draw_objects
-
     rng = generator(SCENE_PURPOSE, seed, episode)
-    simulation.load(draw_objects(simulation.task, objects, split, rng))
+    simulation.load(simulation.task.draw(objects, split, rng))
     return simulation.reset(rng)
 
 
@@ -148,21 +145,27 @@ class _Worker:
 
     def _begin(self, slot: int, episode: int) -> None:
         from graspq.sim.episode import GraspSimulation
+        from graspq.sim.task import task_from_json
 
         if slot not in self.simulations:
-            self.simulations[slot] = GraspSimulation(self.stage.task, self.objects)
+            self.simulations[slot] = GraspSimulation(task_from_json(self.stage.task), self.objects)
         simulation = self.simulations[slot]
         seen = begin_episode(simulation, self.objects, self.stage.split, self.stage.seed, episode)
+        if self.stage.oracle:
+            self._oracle(slot).begin(simulation)
         self.connection.send(Begun(slot, episode, simulation.object_ids))
         self.connection.send(Seen(slot, seen.image, seen.step, seen.gripper_pose))
 
     def _action(self, simulation: "GraspSimulation", command: Command) -> np.ndarray:
         if command.action is not None:
             return command.action
-        from graspq.sim.oracle import Oracle
+        return self._oracle(command.slot).act(simulation.observation, np.random.default_rng(0))
+
+    def _oracle(self, slot: int) -> "Oracle":
+        from graspq.policies.oracle import Oracle
 
         # One for each slot: an oracle follows the plan that it made at the start of an episode.
-        return self.oracles.setdefault(command.slot, Oracle()).act(simulation)
+        return self.oracles.setdefault(slot, Oracle())
 
     def close(self) -> None:
         """Free the simulations."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from graspq.common.action_space import grasping
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
 from graspq.common.machine import available_cores
@@ -31,7 +30,7 @@ from graspq.datasets.pool import ShardPool
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.objects.object_set import ObjectSet
 from graspq.online.plan import Plan
-from graspq.sim.task import TaskSettings
+from graspq.sim.task import Task
 
 DATASET = "dataset"
 
@@ -71,14 +70,14 @@ class GrowingDataset:
 
     folder: Path
     manifest: Manifest
-    task: TaskSettings
+    task: Task
     collection: CollectionSettings
     grasps: int
     workers: int
     blocks: list[tuple[BlockRef, ...]]
 
     @classmethod
-    def open(cls, run: Path, plan: Plan, task: TaskSettings, objects: ObjectSet, pool: ShardPool) -> "GrowingDataset":
+    def open(cls, run: Path, plan: Plan, task: Task, objects: ObjectSet, pool: ShardPool) -> "GrowingDataset":
         """Return the dataset of the run in folder `run`, begun where there is none; finished rounds are verified.
 
         Args:
@@ -159,19 +158,19 @@ def _threads_kept() -> Iterator[None]:
 
 
 def _description(
-    plan: Plan, task: TaskSettings, objects: ObjectSet, collection: CollectionSettings, discount: float
+    plan: Plan, task: Task, objects: ObjectSet, collection: CollectionSettings, discount: float
 ) -> Manifest:
     """Return the manifest of the dataset before its first round."""
     online: dict[str, Any] = plan.described() | {"algo": plan.train.algo, "seed": plan.train.seed}
     return Manifest(
-        task=task.to_json(),
+        task=task.settings.to_json(),
         settings=collection.described() | {"online": online},
         versions=versions(*VERSIONS, "torch"),
         object_set={"name": objects.name, "sha256": objects.digest()},
-        image_shape=(task.image_size, task.image_size, 3),
-        action=grasping(task.action_limits),
+        image_shape=(task.settings.image_size, task.settings.image_size, 3),
+        action=task.action,
         discount=discount,
-        phi_range=(-task.phi_limit, task.phi_limit),
+        phi_range=(-task.settings.phi_limit, task.settings.phi_limit),
     )
 
 

@@ -10,12 +10,13 @@ import numpy as np
 
 from graspq.evaluate.policies import Policy
 from graspq.evaluate.settings import CemSettings
-from graspq.sim.policies import RandomPolicy
+from graspq.policies.random import RandomPolicy
+from graspq.sim.observation import Observation
 
 
 @dataclasses.dataclass(frozen=True)
 class ExploringPolicy:
-    """A `CollectingPolicy` that tosses a coin at each step.
+    """A policy that tosses a coin at each step.
 
         a = random action with probability ε, else that of the policy
 
@@ -35,22 +36,18 @@ class ExploringPolicy:
     random: RandomPolicy
     greedy: Policy
 
-    def act(
-        self, image: np.ndarray, step: int, draws: np.random.Generator, pose: np.ndarray | None = None
-    ) -> np.ndarray:
+    def act(self, observation: Observation, rng: np.random.Generator) -> np.ndarray:
         """Return an action, float32 [4] in [-1, 1].
 
         Args:
-            image: uint8 [H, W, 3] RGB.
-            step: actions taken so far, random ones too.
-            draws: of the coin, the random action and the policy's search.
-            pose: of the gripper, float32 [4], metres and radians; see `Policy.decide`.
+            observation: its step counts all actions taken so far, random ones too.
+            rng: of the coin, the random action and the policy's search.
         """
-        if draws.random() < self.exploration:
-            return self.random.act(draws)
-        poses = None if pose is None else pose[None]
-        steps = np.asarray([step], dtype=np.int64)
-        action: np.ndarray = self.greedy.decide(image[None], steps, [draws], poses).actions[0]
+        if rng.random() < self.exploration:
+            return self.random.act(observation, rng)
+        steps = np.asarray([observation.step], dtype=np.int64)
+        pose = observation.gripper_pose[None]
+        action: np.ndarray = self.greedy.decide(observation.image[None], steps, [rng], pose).actions[0]
         return action
 
 

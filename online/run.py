@@ -20,8 +20,8 @@ from graspq.online.growth import GrowingDataset
 from graspq.online.plan import Plan
 from graspq.online.policy import LatestPolicy
 from graspq.online.pools import PoolOfRounds
-from graspq.sim.policies import RandomPolicy
-from graspq.sim.task import TaskSettings, draw_objects
+from graspq.policies.random import RandomPolicy
+from graspq.sim.task import Task, task_from_json
 from graspq.train.loop import Session, session
 from graspq.train.run import Run
 
@@ -44,7 +44,7 @@ def run_online(plan: Plan, *, show_progress: bool = False) -> Run:
             f"--shards: of another task than that of {plan.start.folder}; leave the option out, or start from scratch"
         )
     training, held_back = pool.split(plan.train.validation_fraction, plan.split_seed)
-    task = TaskSettings.from_json(pool.task)
+    task = task_from_json(pool.task)
     objects = _objects(plan, task, pool)
     extra = {
         "command": "grasp-online",
@@ -59,11 +59,11 @@ def run_online(plan: Plan, *, show_progress: bool = False) -> Run:
     return current.run
 
 
-def _objects(plan: Plan, task: TaskSettings, pool: ShardPool) -> ObjectSet:
+def _objects(plan: Plan, task: Task, pool: ShardPool) -> ObjectSet:
     """Return the object set, after drawing from it once so that a wrong one fails now."""
     wanted = str(pool.object_set["sha256"])
-    objects = find_object_set(task.name, plan.online.objects, wanted, pool.folders)
-    draw_objects(task, objects, "train", generator("online/check"))
+    objects = find_object_set(task, plan.online.objects, wanted, pool.folders)
+    task.draw(objects, "train", generator("online/check"))
     return objects
 
 

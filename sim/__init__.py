@@ -1,4 +1,4 @@
-"""The simulated grasping cell: arm, bin, camera, the two tasks, and the policies that need no learning.
+"""The simulated grasping cell: arm, bin, camera, tasks, the loop that plays an episode, Gymnasium environments.
 
 PyBullet is imported inside this folder alone.
 """

@@ -14,7 +14,7 @@ from graspq.common.errors import UserError
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.episode import GraspSimulation
-from graspq.sim.task import EPISODES_PER_BIN, TASKS, draw_objects, splits_of
+from graspq.sim.task import EPISODES_PER_BIN, TASKS, check_split
 
 _RENDER_SIZE = 256
 
@@ -54,18 +54,17 @@ class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise UserError(f"render_mode {render_mode!r}: choose from rgb_array, human or None")
         self.task = TASKS[self.task_name]
-        if split not in splits_of(self.task):
-            raise UserError(f"split {split!r}: the {self.task_name} task has {', '.join(splits_of(self.task))}")
-        self.objects = ObjectSet.load(objects) if objects is not None else default_object_set(self.task_name)
+        check_split(self.task, split)
+        self.objects = ObjectSet.load(objects) if objects is not None else default_object_set(self.task.object_set)
         self.split, self.render_mode = split, render_mode
-        size = self.task.image_size
+        size = self.task.settings.image_size
         self.observation_space = spaces.Dict(
             {
                 "image": spaces.Box(0, 255, (size, size, 3), np.uint8),
-                "step": spaces.Discrete(self.task.max_steps + 1),
+                "step": spaces.Discrete(self.task.settings.max_steps + 1),
             }
         )
-        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (self.task.action.size,), np.float32)
         self.simulation = GraspSimulation(self.task, self.objects, gui=render_mode == "human")
         self._episodes_in_bin = EPISODES_PER_BIN
 
@@ -75,7 +74,7 @@ class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Start an episode; see the class. `options` takes nothing."""
         super().reset(seed=seed)
         if seed is not None or self._episodes_in_bin >= EPISODES_PER_BIN:
-            self.simulation.load(draw_objects(self.task, self.objects, self.split, self.np_random))
+            self.simulation.load(self.task.draw(self.objects, self.split, self.np_random))
             self._episodes_in_bin = 0
         self._episodes_in_bin += 1
         self.simulation.reset(self.np_random)

@@ -15,7 +15,8 @@ from graspq.objects.object_set import ObjectSet
 from graspq.sim import cell
 from graspq.sim.arm import Arm
 from graspq.sim.camera import Camera
-from graspq.sim.task import TaskSettings, rewarded_object
+from graspq.sim.observation import Observation
+from graspq.sim.task import Task
 from graspq.sim.world import Body, World
 
 _DESCEND_SPEED = 0.0025  # metres a simulation step
@@ -23,21 +24,6 @@ _CLOSE_STEPS = 40
 _LIFT_STEPS = 84
 _HOLD_STEPS = 4  # the last simulation steps of an action, for the arm to come to rest
 _FINISHED = "the episode has ended; call reset first"
-
-
-@dataclasses.dataclass(frozen=True)
-class Observation:
-    """What is known before an action; a learned policy sees the image and the step alone.
-
-    Attributes:
-        image: uint8 [H, W, 3] RGB.
-        step: 0 .. max_steps.
-        gripper_pose: float32 [4], measured x, y, z (metres) and phi (radians, unwrapped).
-    """
-
-    image: np.ndarray
-    step: int
-    gripper_pose: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,10 +47,11 @@ class Outcome:
 class GraspSimulation:
     """A cell with its own physics client; close it, or use it in a `with` statement."""
 
-    def __init__(self, task: TaskSettings, objects: ObjectSet, *, gui: bool = False) -> None:
+    def __init__(self, task: Task, objects: ObjectSet, *, gui: bool = False) -> None:
         self.task, self.objects = task, objects
+        settings = task.settings
         self.camera = Camera()
-        self.world = World(time_step=task.time_step, solver_iterations=task.solver_iterations, gui=gui)
+        self.world = World(time_step=settings.time_step, solver_iterations=settings.solver_iterations, gui=gui)
         self.object_ids: tuple[str, ...] = ()
         self.bodies: list[Body] = []
         self.step_count, self.terminated = 0, True
@@ -73,17 +60,17 @@ class GraspSimulation:
     def load(self, object_ids: Sequence[str]) -> None:
         """Empty the world and build the cell with these objects."""
         self.world.reset()
-        cell.build_bin(self.world, self.task)
-        self.arm = Arm(self.world, self.task)
+        cell.build_bin(self.world, self.task.settings)
+        self.arm = Arm(self.world, self.task.settings)
         self.object_ids = tuple(object_ids)
-        self.bodies = cell.load_objects(self.world, self.task, self.objects, object_ids)
+        self.bodies = cell.load_objects(self.world, self.task.settings, self.objects, object_ids)
         self.terminated = True
 
     def reset(self, rng: np.random.Generator) -> Observation:
         """Drop the objects anew, home the arm and return the first observation."""
         self.arm.park()
-        cell.drop(self.bodies, self.task, rng)
-        cell.settle(self.world, self.bodies, self.task)
+        cell.drop(self.bodies, self.task.settings, rng)
+        cell.settle(self.world, self.bodies, self.task.settings)
         self.arm.place(self.arm.home())
         self.step_count, self.terminated = 0, False
         self._observation = None
@@ -93,7 +80,7 @@ class GraspSimulation:
     def observation(self) -> Observation:
         """The current observation; rendered when first asked for."""
         if self._observation is None:
-            image = self.camera.render(self.world, self.task.image_size)
+            image = self.camera.render(self.world, self.task.settings.image_size)
             self._observation = Observation(image, self.step_count, self.arm.pose().astype(np.float32))
         return self._observation
 
@@ -106,7 +93,7 @@ class GraspSimulation:
         """Apply one action.
 
         Args:
-            action: [4] = [dx, dy, dz, dphi] in units of the action limits, clipped to [-1, 1].
+            action: [A] in units of the limits of the task's actions, clipped to [-1, 1].
             observe_end: render the frame after the lift (collection has no use for it).
 
         Raises:
@@ -115,19 +102,21 @@ class GraspSimulation:
         """
         if self.terminated:
             raise RuntimeError(_FINISHED)
-        values = np.asarray(action, dtype=float)
-        if values.shape != (4,) or not np.isfinite(values).all():
-            raise ValueError(f"an action is four finite numbers, got {action!r}")
-        self.arm.move(self._commanded_after(values), self.task.steps_per_action - _HOLD_STEPS, hold=_HOLD_STEPS)
+        values, settings, space = np.asarray(action, dtype=float), self.task.settings, self.task.action
+        if values.shape != (space.size,) or not np.isfinite(values).all():
+            raise ValueError(f"an action is {space.size} finite numbers ({', '.join(space.names)}), got {action!r}")
+        pose = self.arm.commanded + np.clip(values, -1.0, 1.0) * np.asarray(space.limits)
+        commanded = np.clip(pose, *settings.workspace_bounds)
+        self.arm.move(commanded, settings.steps_per_action - _HOLD_STEPS, hold=_HOLD_STEPS)
         self.step_count += 1
         previous, self._observation = self._observation, None
-        low = bool(self.arm.commanded[2] < self.task.trigger_height)
-        if not low and self.step_count < self.task.max_steps:
+        low = bool(self.arm.commanded[2] < settings.trigger_height)
+        if not low and self.step_count < settings.max_steps:
             return Outcome(self.observation, 0.0, False, {})
         self.terminated = True
         final_pose = self.arm.pose().astype(np.float32)
         lifted = self._close_and_lift(descend=low)
-        rewarded = rewarded_object(self.task, self.objects, lifted)
+        rewarded = self.task.rewarded(self.objects, lifted)
         info = {
             "end": "height" if low else "T",
             "success": rewarded is not None,
@@ -137,11 +126,6 @@ class GraspSimulation:
         last = self.observation if observe_end or previous is None else previous
         return Outcome(last, float(rewarded is not None), True, info)
 
-    def _commanded_after(self, action: np.ndarray) -> np.ndarray:
-        pose = self.arm.commanded + np.clip(action, -1.0, 1.0) * np.asarray(self.task.action_limits)
-        clipped: np.ndarray = np.clip(pose, *self.task.workspace_bounds)
-        return clipped
-
     def _close_and_lift(self, *, descend: bool) -> list[str]:
         """Close where the gripper is (below the trigger height after a descent to the grasp height), then lift.
 
@@ -149,16 +133,16 @@ class GraspSimulation:
         """
         pose = self.arm.commanded.copy()
         if descend:
-            pose[2] = self.task.grasp_height
+            pose[2] = self.task.settings.grasp_height
             steps = max(4, round((self.arm.commanded[2] - pose[2]) / _DESCEND_SPEED))
             self.arm.move(pose, steps, hold=2)
         self.arm.grip(open_gripper=False)
         self.world.step(_CLOSE_STEPS)
-        pose[2] += self.task.lift_height
+        pose[2] += self.task.settings.lift_height
         self.arm.move(pose, _LIFT_STEPS, hold=4)
         heights = [body.pose()[0][2] for body in self.bodies]
         ranked = sorted(range(len(heights)), key=lambda index: -heights[index])
-        return [self.object_ids[index] for index in ranked if heights[index] > self.task.success_height]
+        return [self.object_ids[index] for index in ranked if heights[index] > self.task.settings.success_height]
 
     def render(self, size: int) -> np.ndarray:
         """Return the camera's view at another resolution, uint8 [size, size, 3]."""

@@ -1,4 +1,4 @@
-"""The two tasks as data: what lies in the bin, how the gripper may move, what counts as success.
+"""Tasks: what lies in the bin, how the gripper may move, what counts as success.
 
 A task's settings and `SIMULATOR_VERSION`, which stands for all that is written in the code of this folder, determine an
 episode; a dataset's manifest stores them, so that an evaluation rebuilds the same cell.
@@ -6,11 +6,13 @@ episode; a dataset's manifest stores them, so that an evaluation rebuilds the sa
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.errors import UserError
+from graspq.common.named_objects import named_object
 from graspq.common.options import Settings
 from graspq.objects.object_set import ObjectSet
 
@@ -21,10 +23,10 @@ EPISODES_PER_BIN = 20  # the paper switches the objects every 20 episodes
 
 @dataclasses.dataclass(frozen=True)
 class TaskSettings(Settings):
-    """One task and its cell; metres, radians, seconds, kilograms, newtons.
+    """A task's numbers and its cell; metres, radians, seconds, kilograms, newtons.
 
     Attributes:
-        name: `regular` rewards any lifted object, `targeted` only a target.
+        name: of the task, `regular`, `targeted` or `module:task`.
         objects_per_bin: objects in the bin, targets included.
         targets_per_bin: how many of them are targets (0 in the regular task).
         max_steps: T; the gripper closes at the latest after this many actions.
@@ -53,7 +55,7 @@ class TaskSettings(Settings):
         simulator_version: of the code; settings of another version cannot be simulated.
     """
 
-    name: Literal["regular", "targeted"] = "regular"
+    name: str = "regular"
     objects_per_bin: int = 5
     targets_per_bin: int = 0
     max_steps: int = 15
@@ -94,54 +96,168 @@ class TaskSettings(Settings):
         return low, high
 
 
-TASKS = {
-    "regular": TaskSettings(),
-    "targeted": TaskSettings(name="targeted", objects_per_bin=7, targets_per_bin=3),
-}
+class Task(Protocol):
+    """What a simulation asks of a task; derive your own from `RegularGrasping`, or write all of it."""
+
+    @property
+    def settings(self) -> TaskSettings:
+        """Its numbers; a dataset's manifest holds them as JSON."""
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits that its bins can be filled from."""
+
+    @property
+    def object_set(self) -> str:
+        """Name of the project's own object set that it takes by default, `regular` or `targeted`."""
+
+    @property
+    def action(self) -> ActionSpace:
+        """What an action means."""
+
+    def with_settings(self, settings: TaskSettings) -> "Task":
+        """Return the same task with other numbers."""
+
+    def draw(self, objects: ObjectSet, split: str, rng: np.random.Generator) -> tuple[str, ...]:
+        """Return the ids of the objects in one bin.
+
+        Raises:
+            UserError: the task has no such split, or the object set too few objects in it.
+        """
+
+    def rewarded(self, objects: ObjectSet, lifted: Sequence[str]) -> str | None:
+        """Return the lifted object that earns the reward of 1, or None; `lifted` is ordered, highest first."""
+
+    def wanted(self, objects: ObjectSet, object_id: str) -> bool:
+        """Return whether lifting this object would be rewarded; the oracle goes for those."""
 
 
-def task_settings(name: str) -> TaskSettings:
-    """Return the settings of a task by name.
+@dataclasses.dataclass(frozen=True)
+class RegularGrasping:
+    """Regular grasping: different objects of the split, drawn at random; lifting any of them is a success.
+
+    Source: Quillen et al. 2018, section IV.
+    """
+
+    settings: TaskSettings = TaskSettings()
+    splits: ClassVar[tuple[str, ...]] = ("train", "test")
+    object_set: ClassVar[str] = "regular"
+
+    @property
+    def action(self) -> ActionSpace:
+        """Displacements of the gripper in units of the settings' limits."""
+        return grasping(self.settings.action_limits)
+
+    def with_settings(self, settings: TaskSettings) -> "RegularGrasping":
+        """Return the same task with other numbers."""
+        return dataclasses.replace(self, settings=settings)
+
+    def draw(self, objects: ObjectSet, split: str, rng: np.random.Generator) -> tuple[str, ...]:
+        """Return the ids of `objects_per_bin` different objects of the split; see `Task.draw`."""
+        check_split(self, split)
+        ids, count = at_least(objects, split, self.settings.objects_per_bin), self.settings.objects_per_bin
+        return tuple(ids[index] for index in rng.choice(len(ids), size=count, replace=False))
+
+    def rewarded(self, objects: ObjectSet, lifted: Sequence[str]) -> str | None:
+        """Return the highest of the lifted objects that are wanted; lifting another one beside it still counts."""
+        return next((object_id for object_id in lifted if self.wanted(objects, object_id)), None)
+
+    def wanted(self, objects: ObjectSet, object_id: str) -> bool:
+        """Return True: any object will do."""
+        return True
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetedGrasping(RegularGrasping):
+    """Targeted grasping in clutter: some copies of one target among other objects; only a lifted target is a success.
+
+    Targets and distractors are the same in every episode, in training and in `test`, whose poses are unseen;
+    `test-clutter` has unseen distractors.
+
+    Source: Quillen et al. 2018, section IV.
+    """
+
+    settings: TaskSettings = TaskSettings(name="targeted", objects_per_bin=7, targets_per_bin=3)
+    splits: ClassVar[tuple[str, ...]] = ("train", "test", "test-clutter")
+    object_set: ClassVar[str] = "targeted"
+
+    def draw(self, objects: ObjectSet, split: str, rng: np.random.Generator) -> tuple[str, ...]:
+        """Return the target as often as the settings say, and the distractors; see `Task.draw`."""
+        check_split(self, split)
+        targets = at_least(objects, "target", 1)
+        distractors = "test-distractor" if split == "test-clutter" else "distractor"
+        count = self.settings.objects_per_bin - self.settings.targets_per_bin
+        return (targets[0],) * self.settings.targets_per_bin + at_least(objects, distractors, count)[:count]
+
+    def wanted(self, objects: ObjectSet, object_id: str) -> bool:
+        """Return whether the object is a target."""
+        return objects[object_id].split == "target"
+
+
+TASKS: dict[str, Task] = {"regular": RegularGrasping(), "targeted": TargetedGrasping()}
+
+
+def task_named(name: str) -> Task:
+    """Return a task by name: `regular`, `targeted`, or `module:task` of your own, from the working folder too.
+
+    A task of your own is an object (or a class or function that makes one without arguments); its settings take
+    this name, so that a dataset's manifest leads back to it.
 
     Raises:
-        UserError: there is no such task.
+        UserError: there is no such task, or it lacks a part of `Task`.
     """
-    if name not in TASKS:
-        raise UserError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
-    return TASKS[name]
+    if name in TASKS:
+        return TASKS[name]
+    if ":" not in name:
+        raise UserError(f"unknown task {name!r}; choose from {', '.join(TASKS)}, or module:task of your own")
+    found = named_object(name, "task")
+    if isinstance(found, type) or not hasattr(found, "settings"):
+        found = found() if callable(found) else found
+    missing = [part for part in _PARTS if not hasattr(found, part)]
+    if missing:
+        raise UserError(f"task {name}: has no {missing[0]!r}; derive it from graspq.sim.task.RegularGrasping")
+    task: Task = found
+    return task.with_settings(dataclasses.replace(task.settings, name=name))
 
 
-def splits_of(task: TaskSettings) -> tuple[str, ...]:
-    """Return the splits that a task's bins can be filled from."""
-    return ("train", "test") if task.name == "regular" else ("train", "test", "test-clutter")
+_PARTS = ("settings", "splits", "object_set", "action", "with_settings", "draw", "rewarded", "wanted")
 
 
-def draw_objects(task: TaskSettings, objects: ObjectSet, split: str, rng: np.random.Generator) -> tuple[str, ...]:
-    """Return the ids of the objects in one bin.
+def task_from_json(values: dict[str, Any]) -> Task:
+    """Return the task that a manifest or a run describes: that of its name, with these settings.
 
-    Regular: `objects_per_bin` different objects of the split, drawn at random. Targeted: the same targets and
-    distractors in every episode, in training and in `test` (whose poses are unseen); `test-clutter` has four unseen
-    distractors.
+    Args:
+        values: `task.settings.to_json()`, as it was when the data were made.
 
     Raises:
-        UserError: the object set has too few objects in this split.
+        UserError: there is no such task here, or it was simulated by another version of the simulator.
     """
-    if split not in splits_of(task):
-        raise UserError(f"split {split!r}: the {task.name} task has {', '.join(splits_of(task))}")
-    if task.name == "regular":
-        return _sample(objects, split, task.objects_per_bin, rng)
-    targets = _need(objects, "target", 1)
-    distractors = "test-distractor" if split == "test-clutter" else "distractor"
-    count = task.objects_per_bin - task.targets_per_bin
-    return (targets[0],) * task.targets_per_bin + _need(objects, distractors, count)[:count]
+    task = task_named(str(values["name"]))
+    settings = type(task.settings).from_json(values)
+    if settings.simulator_version != SIMULATOR_VERSION:
+        raise UserError(
+            f"task {settings.name}: of simulator version {settings.simulator_version}, this graspq has "
+            f"{SIMULATOR_VERSION}; use the graspq that made the data, or make them again"
+        )
+    return task.with_settings(settings)
 
 
-def _sample(objects: ObjectSet, split: str, count: int, rng: np.random.Generator) -> tuple[str, ...]:
-    ids = _need(objects, split, count)
-    return tuple(ids[index] for index in rng.choice(len(ids), size=count, replace=False))
+def check_split(task: Task, split: str) -> None:
+    """Refuse a split that a task's bins cannot be filled from.
+
+    Raises:
+        UserError: it is none of `task.splits`.
+    """
+    if split not in task.splits:
+        raise UserError(f"split {split!r}: the {task.settings.name} task has {', '.join(task.splits)}")
 
 
-def _need(objects: ObjectSet, split: str, count: int) -> tuple[str, ...]:
+def at_least(objects: ObjectSet, split: str, count: int) -> tuple[str, ...]:
+    """Return the ids of a split that a task needs `count` objects of.
+
+    Raises:
+        UserError: the object set has fewer.
+    """
     ids = objects.ids(split)
     if len(ids) < count:
         raise UserError(
@@ -149,10 +265,3 @@ def _need(objects: ObjectSet, split: str, count: int) -> tuple[str, ...]:
             "make a set for the task with grasp-objects"
         )
     return ids
-
-
-def rewarded_object(task: TaskSettings, objects: ObjectSet, lifted: Sequence[str]) -> str | None:
-    """Return the lifted object that earns the reward, or None; lifting another object beside a target still counts."""
-    if task.name == "regular":
-        return lifted[0] if lifted else None
-    return next((object_id for object_id in lifted if objects[object_id].split == "target"), None)

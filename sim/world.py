@@ -3,9 +3,10 @@
 Several worlds live side by side in one process; no call can reach another world's client by mistake.
 """
 
+import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -42,6 +43,7 @@ class World:
         if self.client < 0:
             raise RuntimeError("PyBullet could not open its window; is there a display?")
         self.gui = gui
+        self._after_step: Callable[[], None] | None = None
         self.time_step = time_step
         self.solver_iterations = solver_iterations
         self.reset()
@@ -63,6 +65,17 @@ class World:
         """Advance by `count` simulation steps."""
         for _ in range(count):
             bullet.stepSimulation(physicsClientId=self.client)
+            if self._after_step is not None:
+                self._after_step()
+
+    @contextlib.contextmanager
+    def watched(self, after_step: Callable[[], None]) -> Iterator[None]:
+        """Call `after_step` after every simulation step, until the `with` statement ends."""
+        self._after_step = after_step
+        try:
+            yield
+        finally:
+            self._after_step = None
 
     def load_urdf(
         self, path: Path, *, fixed: bool = False, rigid: bool = False, flags: int = 0, position: Vector = (0, 0, 0)

@@ -34,24 +34,23 @@ def collect_regular() -> Callable[[Path, ObjectSet, int, int], Path]:
 
     def collect(folder: Path, objects: ObjectSet, blocks: int, block_size: int) -> Path:
         # Here, and not above: most tests need no simulator.
-        from graspq.common.action_space import grasping
         from graspq.datagen.collect import collect_block
         from graspq.datagen.settings import CollectionSettings
         from graspq.datasets.manifest import Manifest
         from graspq.datasets.writer import commit_shard, write_shard
         from graspq.sim.episode import GraspSimulation
-        from graspq.sim.task import task_settings
+        from graspq.sim.task import TASKS
 
-        task, settings = task_settings("regular"), replace(CollectionSettings(), block_size=block_size)
+        task, settings = TASKS["regular"], replace(CollectionSettings(), block_size=block_size)
         manifest = Manifest(
-            task=task.to_json(),
+            task=task.settings.to_json(),
             settings=settings.described(),
             versions={},
             object_set={"name": objects.name, "sha256": objects.digest()},
-            image_shape=(task.image_size, task.image_size, 3),
-            action=grasping(task.action_limits),
+            image_shape=(task.settings.image_size, task.settings.image_size, 3),
+            action=task.action,
             discount=1.0,
-            phi_range=(-task.phi_limit, task.phi_limit),
+            phi_range=(-task.settings.phi_limit, task.settings.phi_limit),
         )
         objects.copy_to(folder / "objects")
         with GraspSimulation(task, objects) as simulation:

@@ -19,12 +19,13 @@ MAY_IMPORT = {
     "objects": {"common"},
     "sim": {"objects", "common"},
     "datasets": {"common"},
-    "datagen": {"sim", "objects", "datasets", "common"},
     "train": {"datasets", "common"},
-    "evaluate": {"sim", "objects", "train", "datasets", "common"},
+    "policies": {"sim", "train", "objects", "common"},
+    "datagen": {"policies", "sim", "objects", "datasets", "common"},
+    "evaluate": {"policies", "sim", "objects", "train", "datasets", "common"},
     "report": {"evaluate", "train", "datasets", "objects", "common"},
-    "online": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
-    "studies": {"sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "report", "common"},
+    "online": {"policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
+    "studies": {"policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "report", "common"},
 }
 
 

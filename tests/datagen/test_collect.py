@@ -48,7 +48,7 @@ def test_episodes_of_a_block_share_objects_but_not_scenes_and_are_numbered(alone
 
 
 def test_the_reward_stands_on_the_last_row_and_poses_follow_the_actions(alone):
-    limits = np.array(TASKS["regular"].action_limits)
+    limits = np.array(TASKS["regular"].action.limits)
     for episode in alone:
         assert (episode.rewards[:-1] == 0).all()
         assert episode.rewards[-1] == float(episode.success)
@@ -79,9 +79,9 @@ def test_another_policy_sees_image_and_step_and_is_named_and_scenes_stay_the_sam
         def __init__(self):
             self.seen = []
 
-        def act(self, image, step, draws, pose=None):
-            self.seen.append((image, step))
-            return np.array([0, 0, -1 if step > 1 else 0, 0], np.float32)
+        def act(self, observation, rng):
+            self.seen.append((observation.image, observation.step))
+            return np.array([0, 0, -1 if observation.step > 1 else 0, 0], np.float32)
 
     watcher = Watcher()
     with GraspSimulation(TASKS["regular"], regular_objects) as simulation:

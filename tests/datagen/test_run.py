@@ -95,7 +95,7 @@ def test_a_finished_dataset_is_left_alone(finished, objects):
         (("--size", "0"), "expected a whole number of at least 1, such as 2500, 10k or 1M"),
         (("--size", "-5"), "expected a whole number of at least 1"),
         (("--size", "many"), "expected a whole number of at least 1"),
-        (("--task", "stacking"), "'stacking' is not one of 'regular', 'targeted'"),
+        (("--task", "stacking"), "unknown task 'stacking'; choose from regular, targeted"),
         (("--seed", "-1"), "--seed: expected a number of at least 0, got -1"),
         (("--workers", "0"), "--workers: expected a number of at least 1, got 0"),
         (("--objects", "/nowhere"), "/nowhere"),

@@ -104,7 +104,7 @@ def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_hav
     targeted = tmp_path / "targeted"
     shutil.copytree(run_folder, targeted)
     config = json.loads((targeted / "config.json").read_text())
-    config["dataset"]["task"] = TASKS["targeted"].to_json()
+    config["dataset"]["task"] = TASKS["targeted"].settings.to_json()
     (targeted / "config.json").write_text(json.dumps(config))
 
     def tasks(*runs: Path, objects: Path | None = None) -> list[str]:

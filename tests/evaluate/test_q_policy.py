@@ -42,7 +42,7 @@ class Far(QNetwork):
 
 def decided(network: Far, mode: StepMode, steps: list[int]) -> tuple[np.ndarray, np.ndarray | None]:
     cem = CemSettings(iterations=6, samples=256, elites=16, synthetic_step=mode)
-    policy = SyntheticPolicy(network, cem, torch.device("cpu"), EXTRA, TASKS["regular"])
+    policy = SyntheticPolicy(network, cem, torch.device("cpu"), EXTRA, TASKS["regular"].settings)
     images = np.zeros((len(steps), 8, 8, 3), dtype=np.uint8)
     return policy.decide(images, np.asarray(steps), [generator("test", row) for row in range(len(steps))])
 
@@ -83,7 +83,7 @@ def test_a_run_of_supervised_acts_by_synthetic_search_and_one_of_mc_by_search(da
 
 
 def test_a_motion_ends_inside_the_workspace_where_the_pose_is_known() -> None:
-    network, task = Far(), TASKS["regular"]
+    network, task = Far(), TASKS["regular"].settings
     low, high = (np.asarray(bound) for bound in task.workspace_bounds)
     # From the border where BEST leads out of the workspace in y, 3 limits below the least height that it may end at.
     pose = np.array([[0.55, -0.13 + 0.06, 0.015 + 3 * 0.06, 0.0]], dtype=np.float32)

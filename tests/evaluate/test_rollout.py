@@ -13,13 +13,13 @@ from graspq.evaluate.records import EpisodeRow
 from graspq.evaluate.rollout import Rollout, RolloutError
 from graspq.evaluate.workers import Stage, begin_episode, quiet_errors
 from graspq.objects.object_set import ObjectSet
-from graspq.sim.task import task_settings
+from graspq.sim.task import TASKS
 
 EPISODES, ENVIRONMENTS = 5, 3
 
 
 def stage(objects_folder: Path, *, oracle: bool = False, split: str = "test", seed: int = 0) -> Stage:
-    return Stage(task_settings("regular"), str(objects_folder), split, seed, oracle)
+    return Stage(TASKS["regular"].settings.to_json(), str(objects_folder), split, seed, oracle)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_other_seeds_and_other_episodes_meet_other_scenes(objects_folder: Path, 
     with quiet_errors():
         from graspq.sim.episode import GraspSimulation
     objects = ObjectSet.load(objects_folder)
-    with GraspSimulation(task_settings("regular"), objects) as simulation:
+    with GraspSimulation(TASKS["regular"], objects) as simulation:
         assert not np.array_equal(first, begin_episode(simulation, objects, "test", 1, 0).image)
         assert np.array_equal(second, begin_episode(simulation, objects, "test", 0, 1).image)
 

@@ -9,7 +9,7 @@ from graspq.datasets.dataset import open_shards
 from graspq.objects.object_set import ObjectSet
 from graspq.online.growth import GrowingDataset, collection_settings, round_jobs
 from graspq.online.policy import LatestPolicy
-from graspq.sim.policies import RandomPolicy
+from graspq.policies.random import RandomPolicy
 from graspq.sim.task import TASKS
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from graspq.sim import cell, robot_model
 from graspq.sim.episode import GraspSimulation
-from graspq.sim.task import TASKS, draw_objects
+from graspq.sim.task import TASKS
 
 TASK = TASKS["regular"]
 
@@ -13,10 +13,10 @@ TASK = TASKS["regular"]
 def frames(objects, sizes=(64, 256)):
     """Return frames with the gripper in all corners of the workspace, and in places inside it."""
     rng = np.random.default_rng(0)
-    low, high = np.array(TASK.workspace_bounds)
+    low, high = np.array(TASK.settings.workspace_bounds)
     corners = [np.where([corner >> axis & 1 for axis in range(4)], high, low) for corner in range(16)]
     with GraspSimulation(TASK, objects) as simulation:
-        simulation.load(draw_objects(TASK, objects, "test", rng))
+        simulation.load(TASK.draw(objects, "test", rng))
         simulation.reset(rng)
         found = {size: [] for size in sizes}
         for pose in [*corners, *rng.uniform(low, high, (8, 4))]:

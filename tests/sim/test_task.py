@@ -1,21 +1,50 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.sim.task import TASKS, TaskSettings, draw_objects, rewarded_object, task_settings
+from graspq.sim.task import TASKS, RegularGrasping, task_from_json, task_named
+
+OWN = """
+import dataclasses
+from graspq.sim.task import RegularGrasping, TaskSettings
+
+@dataclasses.dataclass(frozen=True)
+class Numbers(TaskSettings):
+    heaviest: float = 0.5
+
+@dataclasses.dataclass(frozen=True)
+class LightGrasping(RegularGrasping):
+    settings: Numbers = Numbers(objects_per_bin=2, max_steps=6)
+
+    def wanted(self, objects, object_id):
+        return objects[object_id].mass < self.settings.heaviest
+
+light = LightGrasping()
+nothing = 3
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    name = f"task_of_{abs(hash(str(tmp_path)))}"
+    (tmp_path / f"{name}.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    return name
 
 
 def test_a_regular_bin_holds_five_different_objects_of_the_split(regular_objects):
     rng = np.random.default_rng(0)
     for _ in range(20):
-        ids = draw_objects(TASKS["regular"], regular_objects, "test", rng)
+        ids = TASKS["regular"].draw(regular_objects, "test", rng)
         assert len(set(ids)) == 5
         assert {regular_objects[object_id].split for object_id in ids} == {"test"}
 
 
 def test_a_targeted_bin_holds_three_crosses_and_four_fixed_distractors(targeted_objects):
     task, rng = TASKS["targeted"], np.random.default_rng(0)
-    train, test, clutter = (draw_objects(task, targeted_objects, s, rng) for s in ("train", "test", "test-clutter"))
+    train, test, clutter = (task.draw(targeted_objects, split, rng) for split in ("train", "test", "test-clutter"))
     splits = [targeted_objects[object_id].split for object_id in train]
     assert splits == ["target"] * 3 + ["distractor"] * 4
     assert train == test
@@ -26,19 +55,41 @@ def test_a_targeted_bin_holds_three_crosses_and_four_fixed_distractors(targeted_
 def test_lifting_another_object_beside_a_target_still_counts(targeted_objects):
     task = TASKS["targeted"]
     target, other = targeted_objects.ids("target")[0], targeted_objects.ids("distractor")[0]
-    assert rewarded_object(task, targeted_objects, (other, target)) == target
-    assert rewarded_object(task, targeted_objects, (other,)) is None
-    assert rewarded_object(task, targeted_objects, ()) is None
+    assert task.rewarded(targeted_objects, (other, target)) == target
+    assert task.rewarded(targeted_objects, (other,)) is None
+    assert task.rewarded(targeted_objects, ()) is None
+    assert TASKS["regular"].rewarded(targeted_objects, (other, target)) == other
 
 
-def test_the_settings_survive_json():
-    assert TaskSettings.from_json(TASKS["targeted"].to_json()) == TASKS["targeted"]
+def test_a_task_is_rebuilt_from_its_settings_in_a_manifest():
+    other = dataclasses.replace(TASKS["targeted"].settings, finger_force=17.0)
+    task = task_from_json(other.to_json())
+    assert task == TASKS["targeted"].with_settings(other)
+    assert type(task) is not RegularGrasping
 
 
-def test_unknown_names_are_refused_in_one_line(regular_objects):
-    with pytest.raises(UserError, match="unknown task 'stacking'; choose from regular, targeted"):
-        task_settings("stacking")
+def test_a_task_of_ones_own_is_named_by_its_module_and_rebuilt_with_its_own_settings(own_module, regular_objects):
+    for task in (task_named(f"{own_module}:light"), task_named(f"{own_module}:LightGrasping")):
+        assert (task.settings.objects_per_bin, task.settings.max_steps) == (2, 6)
+        assert task.settings.name in (f"{own_module}:light", f"{own_module}:LightGrasping")
+    lighter = task.with_settings(dataclasses.replace(task.settings, heaviest=0.0))
+    assert task_from_json(lighter.settings.to_json()) == lighter
+    ids = lighter.draw(regular_objects, "test", np.random.default_rng(0))
+    assert len(ids) == 2 and lighter.rewarded(regular_objects, ids) is None
+
+
+def test_unknown_names_are_refused_in_one_line(regular_objects, own_module):
+    with pytest.raises(UserError, match="unknown task 'stacking'; choose from regular, targeted, or module:task"):
+        task_named("stacking")
+    with pytest.raises(UserError, match="has no 'settings'; derive it from"):
+        task_named(f"{own_module}:nothing")
+    with pytest.raises(UserError, match="has no 'absent'"):
+        task_named(f"{own_module}:absent")
+    with pytest.raises(UserError, match="No module named 'no_such_module'"):
+        task_named("no_such_module:task")
     with pytest.raises(UserError, match="the regular task has train, test"):
-        draw_objects(TASKS["regular"], regular_objects, "test-clutter", np.random.default_rng(0))
+        TASKS["regular"].draw(regular_objects, "test-clutter", np.random.default_rng(0))
     with pytest.raises(UserError, match="no split 'target'; choose from train, test"):
-        draw_objects(TASKS["targeted"], regular_objects, "train", np.random.default_rng(0))
+        TASKS["targeted"].draw(regular_objects, "train", np.random.default_rng(0))
+    with pytest.raises(UserError, match="of simulator version 0"):
+        task_from_json({**TASKS["regular"].settings.to_json(), "simulator_version": 0})

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.episode import GraspSimulation
+from graspq.sim.observation import Observation
 
 _YAWS = np.linspace(-np.pi / 2, np.pi / 2, 24, endpoint=False)
 _OFFSETS = np.linspace(-0.024, 0.024, 7)  # along the pads, from the centre of mass, metres
@@ -35,20 +36,23 @@ class Grasp:
 
 
 class Oracle:
-    """Plans at the first step of an episode, then follows the plan; its action needs the simulation, not the image."""
+    """Plans when an episode begins, then follows the plan; its action needs the simulation, not the image."""
+
+    name, exploration = "oracle", 0.0
 
     def __init__(self) -> None:
         self._surfaces: dict[tuple[str, str], np.ndarray] = {}
-        self._plan: Grasp | None = None
 
-    def act(self, simulation: GraspSimulation) -> np.ndarray:
+    def begin(self, simulation: GraspSimulation) -> None:
+        """Look at the scene and plan."""
+        self._simulation, self._plan = simulation, self.plan(simulation)
+
+    def act(self, observation: Observation, rng: np.random.Generator) -> np.ndarray:
         """Return the next action, float32 [4]."""
-        if simulation.step_count == 0:
-            self._plan = self.plan(simulation)
-        task = simulation.task
-        x, y, _, phi = simulation.arm.commanded
-        goal = self._plan or Grasp(task.bin_center_x, 0.0, 0.0, 0.0, 0.0)
-        limits = np.asarray(task.action_limits)
+        settings = self._simulation.task.settings
+        x, y, _, phi = self._simulation.arm.commanded
+        goal = self._plan or Grasp(settings.bin_center_x, 0.0, 0.0, 0.0, 0.0)
+        limits = np.asarray(settings.action_limits)
         action: np.ndarray = np.array([goal.x - x, goal.y - y, 0.0, goal.phi - phi]) / limits
         if np.abs(action).max() <= 1.0:
             action[2] = -1.0
@@ -65,9 +69,7 @@ class Oracle:
             for object_id, pose in zip(simulation.object_ids, simulation.object_poses().astype(float), strict=True)
         ]
         wanted = [
-            index
-            for index, object_id in enumerate(simulation.object_ids)
-            if simulation.task.name == "regular" or objects[object_id].split == "target"
+            index for index, object_id in enumerate(simulation.object_ids) if simulation.task.wanted(objects, object_id)
         ]
         grasps = [grasp for index in wanted for grasp in self._grasps(simulation, clouds, index)]
         return min(grasps, key=lambda grasp: grasp.cost, default=None)
@@ -81,7 +83,7 @@ class Oracle:
         return points
 
     def _grasps(self, simulation: GraspSimulation, clouds: list[np.ndarray], index: int) -> list[Grasp]:
-        task = simulation.task
+        settings = simulation.task.settings
         own = clouds[index]
         others = np.concatenate([cloud for k, cloud in enumerate(clouds) if k != index] or [np.zeros((0, 3))])
         center = simulation.bodies[index].pose()[0]
@@ -98,9 +100,9 @@ class Oracle:
                     continue
                 along_c, width, cost = grasp
                 x, y = center[:2] + offset * w + along_c * c
-                if max(abs(x - task.bin_center_x), abs(y)) > task.workspace:
+                if max(abs(x - settings.bin_center_x), abs(y)) > settings.workspace:
                     continue
-                if not _clear_of_walls(task.bin_half_width, x - task.bin_center_x, y, c):
+                if not _clear_of_walls(settings.bin_half_width, x - settings.bin_center_x, y, c):
                     continue
                 found.append(Grasp(float(x), float(y), float(phi), width, cost))
         return found

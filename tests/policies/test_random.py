@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.sim.policies import RandomPolicy
+from graspq.policies.random import RandomPolicy
 
 
 def test_actions_are_uniform_but_for_the_descent():
     rng = np.random.default_rng(0)
-    actions = np.stack([RandomPolicy(0.9).act(rng) for _ in range(20_000)])
+    actions = np.stack([RandomPolicy(0.9).act(None, rng) for _ in range(20_000)])
     assert actions.dtype == np.float32
     assert (actions[:, 2] == -1).mean() == pytest.approx(0.9, abs=0.01)
     free = actions[:, [0, 1, 3]]

@@ -3,9 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from graspq.policies.oracle import Oracle
 from graspq.sim.episode import GraspSimulation
-from graspq.sim.oracle import Oracle
-from graspq.sim.task import TASKS, draw_objects
+from graspq.sim.play import play
+from graspq.sim.task import TASKS
 
 
 def successes(task, objects, episodes):
@@ -13,18 +14,16 @@ def successes(task, objects, episodes):
     with GraspSimulation(task, objects) as simulation:
         for episode in range(episodes):
             rng = np.random.default_rng(episode)
-            simulation.load(draw_objects(task, objects, "train", rng))
+            simulation.load(task.draw(objects, "train", rng))
             simulation.reset(rng)
-            outcome = simulation.step(oracle.act(simulation))
-            while not outcome.terminated:
-                outcome = simulation.step(oracle.act(simulation))
-            won += outcome.info["success"]
+            won += play(simulation, oracle, rng, observe_end=False).success
     return won
 
 
 @pytest.mark.parametrize(("count", "least"), [(1, 24), (5, 22)])
 def test_the_oracle_lifts_nearly_always(regular_objects, count, least):
-    task = dataclasses.replace(TASKS["regular"], objects_per_bin=count)
+    task = TASKS["regular"]
+    task = task.with_settings(dataclasses.replace(task.settings, objects_per_bin=count))
     assert successes(task, regular_objects, 25) >= least
 
 

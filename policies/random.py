@@ -1,10 +1,12 @@
 """The random policy of the paper's code: uniform actions that mostly descend."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 
 from graspq.common.options import Settings, setting
+from graspq.sim.observation import Observation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,12 +16,19 @@ class RandomPolicy(Settings):
     Source: Quillen et al. 2018, section VI (the random policy that fills the pool of experience).
     """
 
+    name: ClassVar[str] = "random"
+
     descend_probability: float = setting(
         0.9, help="probability that an action moves straight down by its limit (dz = -1)", minimum=0.0, maximum=1.0
     )
 
-    def act(self, rng: np.random.Generator) -> np.ndarray:
-        """Return a random action, float32 [4]."""
+    @property
+    def exploration(self) -> float:
+        """Its probability of moving straight down."""
+        return self.descend_probability
+
+    def act(self, observation: Observation | None, rng: np.random.Generator) -> np.ndarray:
+        """Return a random action, float32 [4]; it looks at nothing."""
         action = rng.uniform(-1.0, 1.0, size=4)
         if rng.random() < self.descend_probability:
             action[2] = -1.0
