@@ -32,7 +32,6 @@ from timing import median_ratio, report, take_turns
 from torch import Tensor
 
 from graspq.common.options import Command
-from graspq.datasets.blocks import row_bytes
 from graspq.datasets.dataset import open_shards
 from graspq.datasets.loader import TransitionLoader
 from graspq.datasets.pool import ShardPool
@@ -61,7 +60,7 @@ def ours(
 
     def run() -> None:
         pool = open_pool()
-        room = 2 * pool.rows * row_bytes(pool.image_shape) if buffer_bytes is None else buffer_bytes
+        room = 2 * pool.rows * pool.row_bytes if buffer_bytes is None else buffer_bytes
         with TransitionLoader(pool, batch_size, 0, room) as loader:
             consume((to_tensors(batch, CPU) for batch in loader), batches)
 

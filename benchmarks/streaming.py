@@ -20,7 +20,6 @@ from sessions import default_settings
 from timing import median_ratio
 
 from graspq.common.errors import UserError
-from graspq.datasets.blocks import row_bytes
 from graspq.datasets.dataset import open_shards
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
@@ -38,7 +37,7 @@ def larger(pool: ShardPool, batch_size: int) -> tuple[ShardPool, int]:
         rows = sum(ref.rows for ref in blocks) // TIMES
         with contextlib.suppress(UserError):
             Sampler([ref.rows for ref in blocks], batch_size, 0, rows)
-            return replace(pool, blocks=blocks), rows * row_bytes(pool.image_shape)
+            return replace(pool, blocks=blocks), rows * pool.row_bytes
     raise AssertionError
 
 
@@ -108,7 +107,7 @@ def _memory_of_training(shards: tuple[str, ...], steps: int, threads: int | None
     return {
         "training": "mc",
         "steps": steps,
-        "data over buffer": wide.rows * row_bytes(pool.image_shape) / buffer_bytes,
+        "data over buffer": wide.rows * pool.row_bytes / buffer_bytes,
         "epochs": steps * settings.batch_size / wide.rows,
         "buffer, MiB": buffer_bytes / 2**20,
         "before, MiB": start,

@@ -1,51 +1,43 @@
 """Batches as the learner sees them: transitions (s, a, r, s′) and whole episodes padded to T with a mask.
 
-A state is the image and `step`. Dimension key: B batch, T steps, A = 4 action, H W C image.
+A state is the image and `step`. Dimension key: B batch, T steps, A action, H W C image.
 """
 
-from dataclasses import dataclass
-from typing import Any
+import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from graspq.datasets.columns import batch_columns
 from graspq.datasets.episode import Float32, UInt8
+
+if TYPE_CHECKING:
+    import torch
 
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
-
-# One record holds all columns of a step but its image: a sample is then two copies, image and record.
-RECORD = np.dtype(
-    [
-        ("action", np.float32, (4,)),
-        ("synthetic_action", np.float32, (4,)),
-        ("reward", np.float32),
-        ("mc_return", np.float32),
-        ("step", np.int64),
-        ("episode_id", np.int64),
-        ("block", np.int64),
-        ("terminal", np.bool_),
-    ]
-)
 Records = npt.NDArray[Any]
 
 
-@dataclass(frozen=True, eq=False)
-class TransitionBatch:
-    """B transitions.
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Samples:
+    """What transitions and episodes have in common; N stands for B of transitions and for B, T of episodes.
+
+    All arrays are writeable and contiguous: `torch.from_numpy` takes each without a copy.
 
     Attributes:
-        image: uint8 [B, H, W, C], RGB before the action.
-        step: int64 [B], 0 .. T − 1.
-        action: float32 [B, 4], (dx, dy, dz, dφ) in units of the action limits, in [−1, 1].
-        reward: float32 [B].
-        terminal: bool [B]; where it is true there is no s′.
-        next_image: uint8 [B, H, W, C], RGB after the action; its own image where terminal. None where not asked for.
-        next_step: int64 [B], step + 1; its own step where terminal.
-        mc_return: float32 [B], see `labels.mc_return`; with the pool's discount.
-        synthetic_action: float32 [B, 4], see `labels.synthetic_action`; in the units of `action`.
-        episode_id: int64 [B].
-        block: int64 [B].
+        image: uint8 [N, H, W, C], RGB before the action.
+        step: int64 [N], 0 .. T − 1.
+        action: float32 [N, A], in units of the action limits, in [−1, 1].
+        reward: float32 [N].
+        terminal: bool [N], whether this is the last step of its episode.
+        gripper_pose: float32 [N, A], before the action, in the units that the action space names.
+        mc_return: float32 [N], see `labels.mc_return`; with the pool's discount.
+        synthetic_action: float32 [N, A], see `labels.synthetic_action`; in the units of `action`.
+        episode_id: int64 [N].
+        block: int64 [N].
+        more: columns of the table in `columns` that have no attribute here, name → [N, ...].
     """
 
     image: UInt8
@@ -53,70 +45,78 @@ class TransitionBatch:
     action: Float32
     reward: Float32
     terminal: Bool
+    gripper_pose: Float32
+    mc_return: Float32
+    synthetic_action: Float32
+    episode_id: Int64
+    block: Int64
+    more: dict[str, npt.NDArray[Any]] = dataclasses.field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return all arrays by name, those of `more` among them; what was not asked for is left out."""
+        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "more"}
+        return {name: array for name, array in named.items() if array is not None} | self.more
+
+    def tensors(self, device: "torch.device | str" = "cpu") -> dict[str, "torch.Tensor"]:
+        """Return all arrays as tensors by name: without a copy on the CPU, from pinned memory to a GPU."""
+        import torch
+
+        tensors = {name: torch.from_numpy(array) for name, array in self.arrays().items()}
+        if torch.device(device).type == "cuda":
+            tensors = {name: tensor.pin_memory() for name, tensor in tensors.items()}
+        return {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class TransitionBatch(Samples):
+    """B transitions; see `Samples`.
+
+    Attributes:
+        next_image: uint8 [B, H, W, C], RGB after the action; its own image where terminal. None where not asked for.
+        next_step: int64 [B], step + 1; its own step where terminal, for there is no s′.
+    """
+
     next_image: UInt8 | None
     next_step: Int64
-    mc_return: Float32
-    synthetic_action: Float32
-    episode_id: Int64
-    block: Int64
-
-    @property
-    def last(self) -> Bool:
-        """bool [B], whether this is the last step of its episode; the same as `terminal`."""
-        return self.terminal
-
-    def __len__(self) -> int:
-        return len(self.step)
 
 
-@dataclass(frozen=True, eq=False)
-class EpisodeBatch:
-    """B whole episodes, each padded to T steps with zeros; `mask` is true on real steps.
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class EpisodeBatch(Samples):
+    """B whole episodes; see `Samples`. Each is padded to T steps with zeros.
+
+    `step` is 0 .. T − 1 everywhere, and `episode_id` and `block` are the episode's, on padding too.
 
     Attributes:
-        image: uint8 [B, T, H, W, C].
-        step: int64 [B, T]; 0 .. T − 1 everywhere, on padding too.
-        action: float32 [B, T, 4], in units of the action limits.
-        reward: float32 [B, T].
-        terminal: bool [B, T], true on the last real step alone.
-        mc_return: float32 [B, T].
-        synthetic_action: float32 [B, T, 4].
-        episode_id: int64 [B, T], on padding too.
-        block: int64 [B, T], on padding too.
-        mask: bool [B, T].
+        mask: bool [B, T], true on real steps.
     """
 
-    image: UInt8
-    step: Int64
-    action: Float32
-    reward: Float32
-    terminal: Bool
-    mc_return: Float32
-    synthetic_action: Float32
-    episode_id: Int64
-    block: Int64
     mask: Bool
 
-    @property
-    def last(self) -> Bool:
-        """bool [B, T], whether this is the last step of its episode; the same as `terminal`."""
-        return self.terminal
 
-    def __len__(self) -> int:
-        return len(self.step)
+NAMED = {field.name for field in dataclasses.fields(Samples)}
 
 
 def transition_batch(image: UInt8, next_image: UInt8 | None, records: Records) -> TransitionBatch:
-    """Return the batch of B gathered records and images; `records` is RECORD [B]."""
-    columns = {name: np.ascontiguousarray(records[name]) for name in RECORD.names or ()}
+    """Return the batch of B gathered records and images; `records` is [B] of `columns.record_dtype`."""
+    columns = _split(records)
     next_step = columns["step"] + ~columns["terminal"]
     return TransitionBatch(image=image, next_image=next_image, next_step=next_step, **columns)
 
 
 def episode_batch(image: UInt8, records: Records, mask: Bool) -> EpisodeBatch:
-    """Return the batch of B gathered, padded episodes; `records` is RECORD [B, T]."""
-    columns = {name: np.ascontiguousarray(records[name]) for name in RECORD.names or ()}
+    """Return the batch of B gathered, padded episodes; `records` is [B, T] of `columns.record_dtype`."""
+    columns = _split(records)
     columns["step"][:] = np.arange(mask.shape[1])
     for name in ("episode_id", "block"):
         columns[name][:] = columns[name][:, :1]
     return EpisodeBatch(image=image, mask=mask, **columns)
+
+
+def _split(records: Records) -> dict[str, Any]:
+    """Return the columns of records as arguments of a batch."""
+    columns = {name: np.ascontiguousarray(records[name]) for name in batch_columns()}
+    more = {name: column for name, column in columns.items() if name not in NAMED}
+    return {name: column for name, column in columns.items() if name in NAMED} | {"more": more}

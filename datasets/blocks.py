@@ -13,8 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
-from graspq.datasets.batch import RECORD, Bool, Int64, Records
-from graspq.datasets.episode import Float32, UInt8
+from graspq.datasets.batch import Bool, Int64, Records
+from graspq.datasets.columns import Sizes, record_dtype
+from graspq.datasets.episode import UInt8
 from graspq.datasets.labels import mc_return
 
 REMEDY = "`grasp-data verify` lists all faults; the command that made the dataset makes bad shards again"
@@ -48,15 +49,13 @@ class BlockArrays:
     Attributes:
         block: number of the block.
         images: uint8 [N, H, W, C], RGB.
-        gripper_pose: float32 [N, 4], (x, y, z, φ) before the action; metres and radians.
-        records: RECORD [N], all other columns.
+        records: [N] of `columns.record_dtype`, all other columns.
         first_rows: int64 [E], the first row of each of its E episodes.
         lengths: int64 [E], steps of each.
     """
 
     block: int
     images: UInt8
-    gripper_pose: Float32
     records: Records
     first_rows: Int64
     lengths: Int64
@@ -64,20 +63,20 @@ class BlockArrays:
     @property
     def bytes(self) -> int:
         """Memory that it holds."""
-        return self.images.nbytes + self.records.nbytes + self.gripper_pose.nbytes
+        return self.images.nbytes + self.records.nbytes
 
 
-def row_bytes(image_shape: tuple[int, int, int]) -> int:
+def row_bytes(sizes: Sizes) -> int:
     """Return the memory of one row of a `BlockArrays`."""
-    return int(np.prod(image_shape)) + RECORD.itemsize + 4 * 4
+    return sizes["H"] * sizes["W"] * sizes["C"] + record_dtype(sizes).itemsize
 
 
-def read_block(ref: BlockRef, image_shape: tuple[int, int, int], metadata: Any = None) -> BlockArrays:
+def read_block(ref: BlockRef, sizes: Sizes, metadata: Any = None) -> BlockArrays:
     """Return the rows of a block.
 
     Args:
         ref: the block.
-        image_shape: (H, W, C).
+        sizes: see `columns.sizes_of`.
         metadata: the file's footer where it was read before.
 
     Raises:
@@ -86,14 +85,14 @@ def read_block(ref: BlockRef, image_shape: tuple[int, int, int], metadata: Any =
     try:
         with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
             table = file.read_row_group(ref.row_group, use_threads=False)
-        return _block_arrays(ref, table, image_shape)
+        return _block_arrays(ref, table, sizes)
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
 
 
 def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> dict[str, Any]:
-    """Return some columns of a block as numpy arrays, [N] or [N, width], without reading the others.
+    """Return some columns of a block as numpy arrays, [N] or [N, ...], without reading the others.
 
     Args:
         ref: the block.
@@ -121,11 +120,10 @@ def relabelled(block: BlockArrays, discount: float) -> BlockArrays:
     return replace(block, records=records)
 
 
-def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, int]) -> BlockArrays:
-    records = np.zeros(table.num_rows, RECORD)
-    for name in RECORD.names or ():
-        if name != "block":
-            records[name] = _numpy(table.column(name))
+def _block_arrays(ref: BlockRef, table: pa.Table, sizes: Sizes) -> BlockArrays:
+    records = np.zeros(table.num_rows, record_dtype(sizes))
+    for name in (records.dtype.names or ())[:-1]:
+        records[name] = _numpy(table.column(name))
     records["block"] = ref.block
     terminal: Bool = records["terminal"]
     first_rows = np.flatnonzero(np.concatenate([[True], terminal[:-1]])).astype(np.int64)
@@ -133,8 +131,7 @@ def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, i
         raise ValueError(f"expected {ref.rows} rows of {ref.episodes} whole episodes")
     return BlockArrays(
         block=ref.block,
-        images=_numpy(table.column("image")).reshape(-1, *image_shape),
-        gripper_pose=_numpy(table.column("gripper_pose")),
+        images=_numpy(table.column("image")).reshape(-1, *(sizes[letter] for letter in "HWC")),
         records=records,
         first_rows=first_rows,
         lengths=np.diff(np.append(first_rows, table.num_rows)),
@@ -142,13 +139,17 @@ def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, i
 
 
 def _numpy(column: pa.ChunkedArray) -> Any:
-    """Return a column as numpy: [N], or [N, width] for vectors and images; a view wherever Arrow allows one."""
-    array = column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks)
+    """Return a column as numpy: [N], or [N, ...] for arrays and images; a view wherever Arrow allows one."""
+    return _array(column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks))
+
+
+def _array(array: pa.Array) -> Any:
     if pa.types.is_fixed_size_binary(array.type):
         width = array.type.byte_width
         flat = np.frombuffer(array.buffers()[1], np.uint8, len(array) * width, array.offset * width)
         flat.flags.writeable = False
         return flat.reshape(len(array), width)
     if pa.types.is_fixed_size_list(array.type):
-        return array.flatten().to_numpy().reshape(len(array), array.type.list_size)
+        inner = _array(array.flatten())
+        return inner.reshape(len(array), array.type.list_size, *inner.shape[1:])
     return array.to_numpy(zero_copy_only=False)

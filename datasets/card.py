@@ -5,9 +5,14 @@ Its text depends on the manifest alone. The manifest lists its digest, so that `
 
 import dataclasses
 import hashlib
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspq.common.files import write_text
+from graspq.common.text import markdown
+from graspq.datasets import columns
+from graspq.datasets.columns import VARYING, Column, Sizes, quantities, sizes_of
 from graspq.datasets.manifest import Manifest, steps_file
 
 CARD_NAME = "README.md"
@@ -78,55 +83,42 @@ image = np.frombuffer(steps[0]["image"], np.uint8).reshape({height}, {width}, 3)
 
 ## Steps
 
-| column | type | meaning |
-|---|---|---|
-| `episode_id` | int64 | number of the attempt |
-| `step` | int32 | number of the step in its attempt, from 0 |
-| `image` | {image_bytes} bytes | RGB before the action, {height} x {width} x 3 uint8, row by row |
-| `action` | float32[4] | dx, dy, dz, dphi in units of the action limits, in [-1, 1] |
-| `reward` | float32 | 1 for a successful grasp, at the last step only |
-| `terminal` | bool | whether this is the last step; the next image of every other row is that of the next row |
-| `gripper_pose` | float32[4] | x, y, z (m), phi (rad, unwrapped) before the action |
-| `mc_return` | float32 | discounted return from this step on, discount {discount:g} |
-| `synthetic_action` | float32[4] | final pose minus this pose, in the units of `action` |
-
-An action of 1 commands {limits[0]:g}, {limits[1]:g}, {limits[2]:g} m and {limits[3]:g} rad.
+{steps_table}
+An action of 1 commands {limits}.
 
 ## Episodes
 
-| column | type | meaning |
-|---|---|---|
-| `episode_id`, `block`, `seed` | int64 | of the attempt, of its block (attempts with the same objects), of its scene |
-| `object_ids` | list of string | the objects in the bin, files in `objects/` |
-| `object_poses` | list of float32[7] | x, y, z (m), qx, qy, qz, qw of each after settling |
-| `steps` | int32 | number of steps |
-| `end` | string | `height`: the gripper went below the height threshold; `T`: the last allowed step |
-| `success`, `lifted_object` | bool, string | whether the attempt succeeded, and what was lifted |
-| `policy`, `exploration` | string, float64 | what acted, and its exploration parameter |
-| `final_pose` | float32[4] | x, y, z (m), phi (rad) after the last action, before the scripted descent |
-
+{episodes_table}
 `manifest.json` lists every file with its SHA-256 and all settings; `grasp-data verify` checks them.
 """
 
 
 def card_text(manifest: Manifest) -> str:
     """Return the card of a dataset of at least one shard."""
-    height, width, channels = manifest.image_shape
+    height, width, _ = manifest.image_shape
+    action = manifest.action
+    facts = {
+        "action": ", ".join(action.names),
+        "pose": quantities(action.pose, action.units, "{} ({})"),
+        "discount": f"{manifest.discount:g}",
+        "height": height,
+        "width": width,
+    }
+    sizes = sizes_of(manifest.image_shape, action)
     return TEMPLATE.format(
+        **facts,
         task=manifest.task_name,
         episodes=manifest.episodes,
         rows=manifest.rows,
         success=manifest.successes / manifest.episodes,
         size=_size_category(manifest.rows),
         objects=manifest.object_set["name"],
-        height=height,
-        width=width,
-        image_bytes=height * width * channels,
         first_shard=steps_file(manifest.shards[0].name),
-        discount=manifest.discount,
-        limits=manifest.action_limits,
-        steps_features=_features(STEPS_FEATURES),
-        episodes_features=_features(EPISODES_FEATURES),
+        limits=quantities(action.limits, action.units),
+        steps_features=_features(columns.STEPS, sizes),
+        episodes_features=_features(columns.EPISODES, sizes),
+        steps_table=_table(columns.STEPS, sizes, facts),
+        episodes_table=_table(columns.EPISODES, sizes, facts),
     )
 
 
@@ -140,48 +132,36 @@ def write_card(folder: Path, manifest: Manifest) -> Manifest:
     return updated
 
 
-STEPS_FEATURES: dict[str, object] = {
-    "episode_id": "int64",
-    "step": "int32",
-    "image": "binary",
-    "action": ("float32", 4),
-    "reward": "float32",
-    "terminal": "bool",
-    "gripper_pose": ("float32", 4),
-    "mc_return": "float32",
-    "synthetic_action": ("float32", 4),
-}
-EPISODES_FEATURES: dict[str, object] = {
-    "episode_id": "int64",
-    "block": "int64",
-    "seed": "int64",
-    "object_ids": ("string", None),
-    "object_poses": (("float32", 7), None),
-    "steps": "int32",
-    "end": "string",
-    "success": "bool",
-    "lifted_object": "string",
-    "policy": "string",
-    "exploration": "float64",
-    "final_pose": ("float32", 4),
-}
+def _table(described: Sequence[Column], sizes: Sizes, facts: Mapping[str, object]) -> str:
+    """Return the columns of a table as Markdown: name, type, meaning."""
+    rows = [(f"`{column.name}`", _type(column, sizes), column.meaning.format(**facts)) for column in described]
+    return markdown(("column", "type", "meaning"), rows)
 
 
-def _features(features: dict[str, object]) -> str:
+def _type(column: Column, sizes: Sizes) -> str:
+    dimensions = column.dimensions(sizes)
+    if column.dtype == "uint8":
+        return f"{math.prod(dimensions)} bytes"
+    varying = "list of " if VARYING in dimensions else ""
+    return varying + column.dtype + "".join(f"[{size}]" for size in dimensions if size != VARYING)
+
+
+def _features(described: Sequence[Column], sizes: Sizes) -> str:
+    """Return the YAML lines that declare the types of a table."""
     lines = []
-    for name, kind in features.items():
-        lines += [f"  - name: {name}", *(f"    {line}" for line in _feature(kind))]
+    for column in described:
+        dtype = "binary" if column.dtype == "uint8" else column.dtype
+        dimensions = () if dtype == "binary" else column.dimensions(sizes)
+        lines += [f"  - name: {column.name}", *(f"    {line}" for line in _feature(dtype, dimensions))]
     return "\n".join(lines)
 
 
-def _feature(kind: object) -> list[str]:
-    """Return the YAML lines of one type: a name, or a list (type, length) with length None where it varies."""
-    if not isinstance(kind, tuple):
-        return [f"dtype: {kind}"]
-    inner, length = kind
-    nested = _feature(inner)
-    lines = [f"list: {inner}"] if not isinstance(inner, tuple) else ["list:", *(f"  {line}" for line in nested)]
-    return lines + [f"length: {length}"] * (length is not None)
+def _feature(dtype: str, dimensions: tuple[int, ...]) -> list[str]:
+    if not dimensions:
+        return [f"dtype: {dtype}"]
+    length, *inner = dimensions
+    nested = ["list:", *(f"  {line}" for line in _feature(dtype, tuple(inner)))] if inner else [f"list: {dtype}"]
+    return nested + [f"length: {length}"] * (length != VARYING)
 
 
 def _size_category(rows: int) -> str:

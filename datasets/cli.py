@@ -3,7 +3,6 @@
 The work is done in `dataset`, `verify` and `show`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,8 @@ from tqdm import tqdm
 
 from graspq.common.errors import UserError
 from graspq.common.options import Group, Settings, options_from, setting, with_version
+from graspq.common.text import aligned, bytes_text, counted
+from graspq.datasets.columns import quantities
 from graspq.datasets.dataset import Dataset
 from graspq.datasets.manifest import Manifest
 
@@ -53,7 +54,8 @@ def main() -> None:
 def info(settings: InfoSettings) -> None:
     """Print what datasets hold, from their manifests."""
     manifests = [Dataset.open(path).manifest for path in settings.path]
-    click.echo(table([_described(path, manifest) for path, manifest in zip(settings.path, manifests, strict=True)]))
+    described = [_described(path, manifest) for path, manifest in zip(settings.path, manifests, strict=True)]
+    click.echo(aligned([[name, *(values[name] for values in described)] for name in described[0]]))
 
 
 @main.command()
@@ -63,13 +65,13 @@ def verify(settings: VerifySettings) -> int:
     from graspq.datasets.verify import verify as verify_dataset
 
     total = Dataset.open(settings.path).manifest.bytes
-    with tqdm(total=total, unit="B", unit_scale=True, unit_divisor=1024, desc="verify", disable=None) as bar:
+    with tqdm(total=total, unit="B", unit_scale=True, desc="verify", disable=None) as bar:
         report = verify_dataset(settings.path, bar.update)
     for line in report.notes:
         click.echo(f"note: {line}")
     for line in report.faults:
         click.echo(f"fault: {line}", err=True)
-    checked = f"{report.files:,} files, {size(report.bytes)}"
+    checked = f"{report.files:,} files, {bytes_text(report.bytes)}"
     if report.faults:
         remedy = "the command that made the dataset makes bad shards again"
         click.echo(f"{settings.path}: {counted(len(report.faults), 'fault')} in {checked}; {remedy}", err=True)
@@ -89,14 +91,13 @@ def show(settings: ShowSettings) -> None:
     outcome = None if settings.success == settings.failure else settings.success
     strips = choose_strips(dataset, settings.episodes, settings.seed, outcome)
     name = settings.path.resolve().name
-    save_strips(settings.out, strips, f"{dataset.manifest.task_name} grasping · {name}")
+    save_strips(settings.out, strips, dataset.manifest.action.names, f"{dataset.manifest.task_name} grasping · {name}")
     click.echo(f"{settings.out}: {counted(len(strips), 'episode')}")
 
 
 def _described(path: Path, manifest: Manifest) -> dict[str, str]:
     if not manifest.shards:
         raise UserError(f"{path}: the dataset has no finished shard yet; run the command that makes it again")
-    dx, dy, dz, dphi = manifest.action_limits
     return {
         "dataset": str(path),
         "task": manifest.task_name,
@@ -104,36 +105,12 @@ def _described(path: Path, manifest: Manifest) -> dict[str, str]:
         "rows": f"{manifest.rows:,}",
         "success rate": f"{manifest.successes / manifest.episodes:.4f}",
         "mean steps": f"{manifest.rows / manifest.episodes:.2f}",
-        "size": size(manifest.bytes),
+        "size": bytes_text(manifest.bytes),
         "bytes per frame": f"{manifest.bytes / manifest.rows:.0f}",
         "shards": f"{len(manifest.shards):,}",
         "image": " x ".join(map(str, manifest.image_shape)),
         "object set": str(manifest.object_set["name"]),
         "discount": f"{manifest.discount:g}",
-        "action limits": f"{dx:g}, {dy:g}, {dz:g} m, {dphi:g} rad",
+        "action limits": quantities(manifest.action.limits, manifest.action.units),
         "manifest digest": manifest.digest()[:16],
     }
-
-
-def table(columns: Sequence[dict[str, str]]) -> str:
-    """Return aligned lines: the names of the rows, then one column for each dict; all have the same keys."""
-    rows = [[name, *(column[name] for column in columns)] for name in columns[0]]
-    widths = [max(len(row[index]) for row in rows) for index in range(len(columns) + 1)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun: `1 fault`, `2 faults`."""
-    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
-
-
-def size(count: int) -> str:
-    """Return bytes as people read them: `1.5 MiB`."""
-    value = float(count)
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if value < 1024:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1024
-    return f"{value:.1f} TiB"

@@ -1,6 +1,7 @@
 """One finished grasp attempt, as the simulator hands it to the shard writer and as the reader gives it back.
 
-Labels are not part of it: they are functions of it, in `labels`. Dimension key: T steps, K objects, H W C image.
+Labels are not part of it: they are functions of it, in `labels`. Dimension key: T steps, A parts of an
+action, K objects, H W C image.
 """
 
 from dataclasses import dataclass
@@ -26,10 +27,10 @@ class Episode:
         object_ids: [K] names of the objects in the bin.
         object_poses: float32 [K, 7], (x, y, z, qx, qy, qz, qw) in the world after settling; metres, unit quaternion.
         images: uint8 [T, H, W, 3], RGB seen before each action.
-        actions: float32 [T, 4], (dx, dy, dz, dφ) in units of the action limits, in [−1, 1].
+        actions: float32 [T, A], in units of the action limits, in [−1, 1].
         rewards: float32 [T].
-        gripper_poses: float32 [T, 4], measured (x, y, z, φ) before each action; metres and radians, φ unwrapped.
-        final_pose: float32 [4], measured after the last action and before the scripted descent.
+        gripper_poses: float32 [T, A], measured before each action, in the units of the action space; angles unwrapped.
+        final_pose: float32 [A], measured after the last action and before the scripted descent.
         end: what ended it, `"height"` (the height trigger) or `"T"` (the last allowed step).
         success: whether it counts as a success of the task.
         lifted_object: name of the object that was lifted, or None.
@@ -61,10 +62,11 @@ class Episode:
         if steps < 1 or self.images.ndim != 4 or self.images.shape[3] != 3:
             raise ValueError(f"images: expected uint8 [T ≥ 1, H, W, 3], got {self.images.shape}")
         _check("images", self.images, np.uint8, self.images.shape)
-        _check("actions", self.actions, np.float32, (steps, 4))
+        size = self.actions.shape[-1]
+        _check("actions", self.actions, np.float32, (steps, size))
         _check("rewards", self.rewards, np.float32, (steps,))
-        _check("gripper_poses", self.gripper_poses, np.float32, (steps, 4))
-        _check("final_pose", self.final_pose, np.float32, (4,))
+        _check("gripper_poses", self.gripper_poses, np.float32, (steps, size))
+        _check("final_pose", self.final_pose, np.float32, (size,))
         _check("object_poses", self.object_poses, np.float32, (len(self.object_ids), 7))
         if self.end not in ENDS:
             raise ValueError(f"end: expected one of {', '.join(ENDS)}, got {self.end!r}")

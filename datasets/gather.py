@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pyarrow as pa
 
-from graspq.datasets.batch import RECORD, EpisodeBatch, Int64, TransitionBatch, episode_batch, transition_batch
+from graspq.datasets.batch import EpisodeBatch, Int64, TransitionBatch, episode_batch, transition_batch
 from graspq.datasets.blocks import BlockArrays
 from graspq.datasets.episode import UInt8
 
@@ -20,7 +20,7 @@ def gather_transitions(blocks: Blocks, owners: list[int], rows: list[int], need_
     shape = blocks[owners[0]].images.shape[1:]
     image = _room((len(rows), *shape))
     next_image = _room((len(rows), *shape)) if need_next else None
-    records = np.empty(len(rows), RECORD)
+    records = np.empty(len(rows), blocks[owners[0]].records.dtype)
     for index, (owner, row) in enumerate(zip(owners, rows, strict=True)):
         block = blocks[owner]
         image[index] = block.images[row]
@@ -38,7 +38,7 @@ def gather_episodes(blocks: Blocks, owners: list[int], numbers: list[int], max_s
     """
     shape = blocks[owners[0]].images.shape[1:]
     image = _room((len(numbers), max_steps, *shape))
-    records = np.zeros((len(numbers), max_steps), RECORD)
+    records = np.zeros((len(numbers), max_steps), blocks[owners[0]].records.dtype)
     mask = np.zeros((len(numbers), max_steps), np.bool_)
     for index, (owner, number) in enumerate(zip(owners, numbers, strict=True)):
         block = blocks[owner]

@@ -1,6 +1,6 @@
 """Labels that are functions of an episode: the Monte-Carlo return and the synthetic action.
 
-They are stored beside the steps for training to read, and recomputed by `verify`. Dimension key: T steps.
+They are stored beside the steps for training to read, and recomputed by `verify`. T steps, A parts of an action.
 """
 
 from collections.abc import Sequence
@@ -39,21 +39,21 @@ def synthetic_action(gripper_poses: Float32, final_pose: Float32, action_limits:
     """Return the one action that would lead from each pose to the last, (p_T − pₜ) / limits.
 
     Args:
-        gripper_poses: float32 [T, 4], measured (x, y, z, φ) before each action; metres and radians, φ unwrapped.
-        final_pose: float32 [4], p_T, measured after the last action and before the scripted descent.
-        action_limits: 4 numbers > 0, what an action of 1 commands; metres, metres, metres, radians.
+        gripper_poses: float32 [T, A], measured before each action; angles unwrapped.
+        final_pose: float32 [A], p_T, measured after the last action and before the scripted descent.
+        action_limits: A numbers > 0, what an action of 1 commands, in the units of the poses.
 
     Returns:
-        float32 [T, 4], in the units of `action`; it may leave [−1, 1], since it spans several steps.
+        float32 [T, A], in the units of `action`; it may leave [−1, 1], since it spans several steps.
 
     Raises:
-        ValueError: a limit is not greater than 0.
+        ValueError: a limit is not greater than 0, or there are more or fewer than A.
 
     Source: section IV, supervised learning (a = p_T − pₜ).
     Differs: the authors' code sums the commanded actions instead; ours takes measured poses, as the text says.
     """
     limits = np.asarray(action_limits, np.float64)
-    if limits.shape != (4,) or not (limits > 0).all():
-        raise ValueError(f"action_limits: expected 4 numbers greater than 0, got {list(action_limits)}")
+    if limits.shape != final_pose.shape or not (limits > 0).all():
+        raise ValueError(f"action_limits: expected {final_pose.size} numbers greater than 0, got {list(action_limits)}")
     displacement = final_pose.astype(np.float64) - gripper_poses.astype(np.float64)
     return (displacement / limits).astype(np.float32)

@@ -17,7 +17,7 @@ from typing import Generic, Self, TypeVar
 import numpy as np
 
 from graspq.datasets.batch import EpisodeBatch, Int64, TransitionBatch
-from graspq.datasets.blocks import BlockArrays, row_bytes
+from graspq.datasets.blocks import BlockArrays
 from graspq.datasets.gather import Blocks, gather_episodes, gather_transitions, located
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
@@ -224,7 +224,7 @@ class TransitionLoader(_Loader[TransitionBatch]):
         need_next: bool = True,
     ) -> None:
         self._need_next = need_next
-        rows = buffer_bytes // row_bytes(pool.image_shape)
+        rows = buffer_bytes // pool.row_bytes
         sampler = Sampler([ref.rows for ref in pool.blocks], batch_size, seed, rows, rank, ranks)
         super().__init__(pool, sampler, start_step, prefetch)
 
@@ -251,7 +251,7 @@ class EpisodeLoader(_Loader[EpisodeBatch]):
         max_steps: int | None = None,
     ) -> None:
         self._max_steps = pool.max_steps if max_steps is None else max_steps
-        rows = buffer_bytes // row_bytes(pool.image_shape)
+        rows = buffer_bytes // pool.row_bytes
         episodes = [ref.episodes for ref in pool.blocks]
         sampler = Sampler(
             [ref.rows for ref in pool.blocks], batch_size, seed, rows, rank, ranks, items_per_block=episodes

@@ -8,7 +8,8 @@ from typing import Any
 
 from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
-from graspq.datasets.blocks import BlockArrays, BlockRef, read_block, read_columns, relabelled
+from graspq.datasets.blocks import BlockArrays, BlockRef, read_block, read_columns, relabelled, row_bytes
+from graspq.datasets.columns import sizes_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +57,18 @@ class ShardPool:
         return int(self.task["max_steps"])
 
     @property
+    def row_bytes(self) -> int:
+        """Memory of one step when it is read."""
+        return row_bytes(sizes_of(self.image_shape, self.action))
+
+    @property
     def folders(self) -> tuple[Path, ...]:
         """Folders of the datasets that the blocks lie in, each once."""
         return tuple(dict.fromkeys(ref.path.absolute().parent.parent for ref in self.blocks))
 
     def read_block(self, ref: BlockRef) -> BlockArrays:
         """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""
-        block = read_block(ref, self.image_shape, self._footers.get(ref.path))
+        block = read_block(ref, sizes_of(self.image_shape, self.action), self._footers.get(ref.path))
         return relabelled(block, self.discount) if self._relabels else block
 
     def read_columns(self, ref: BlockRef, names: Sequence[str]) -> dict[str, Any]:

@@ -22,14 +22,13 @@ from graspq.datasets.episode import UInt8
 from graspq.datasets.manifest import ShardEntry
 
 SUCCESS, FAILURE, MUTED, INK = "#1b8a4b", "#a8493f", "#8a8f98", "#22262b"
-ACTION_COLORS = ("#3b6fb6", "#2a9d8f", "#d98324", "#8457a8")
-ACTION_NAMES = ("dx", "dy", "dz", "dφ")
+ACTION_COLORS = ("#3b6fb6", "#2a9d8f", "#d98324", "#8457a8", "#b0568c", "#6f7f2f", "#4aa3c7", "#8c5a3c")
 CELL, HEADER, TITLE = 1.05, 0.34, 0.72
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """One episode to be drawn: `row` of the episodes table, images uint8 [T, H, W, 3] and records RECORD [T]."""
+    """One episode to be drawn: its row in the episodes table, images uint8 [T, H, W, 3], records [T]."""
 
     row: dict[str, Any]
     images: UInt8
@@ -81,13 +80,13 @@ def _read(dataset: Dataset, entry: ShardEntry, rows: list[dict[str, Any]]) -> li
     return strips
 
 
-def save_strips(path: Path, strips: Sequence[Strip], title: str) -> None:
+def save_strips(path: Path, strips: Sequence[Strip], names: Sequence[str], title: str) -> None:
     """Draw the strips and write them to `path` as PNG.
 
     Raises:
         UserError: the file cannot be written.
     """
-    figure = draw_strips(strips, title)
+    figure = draw_strips(strips, names, title)
     try:
         with committed(path) as temporary:
             figure.savefig(temporary, format="png", dpi=160, facecolor="white")
@@ -95,14 +94,14 @@ def save_strips(path: Path, strips: Sequence[Strip], title: str) -> None:
         raise UserError(f"{path}: cannot write the picture ({error.strerror}); choose another --out") from None
 
 
-def draw_strips(strips: Sequence[Strip], title: str) -> Figure:
-    """Return the figure of the strips, one row each."""
+def draw_strips(strips: Sequence[Strip], names: Sequence[str], title: str) -> Figure:
+    """Return the figure of the strips, one row each; `names` are those of the parts of an action."""
     columns = max(len(strip.records) for strip in strips)
     row_height = HEADER + CELL * 1.62
     width, height = max(6.0, 0.5 + columns * CELL * 1.04), TITLE + len(strips) * row_height + 0.15
     figure = Figure(figsize=(width, height))
     figure.text(0.25 / width, 1 - 0.28 / height, title, fontsize=11, weight="bold", color=INK, va="center")
-    _legend(figure, width, height)
+    _legend(figure, names, width, height)
     for index, strip in enumerate(strips):
         top = 1 - (TITLE + index * row_height) / height
         _header(figure, strip, 0.25 / width, top - 0.16 / height)
@@ -116,12 +115,14 @@ def draw_strips(strips: Sequence[Strip], title: str) -> Figure:
     return figure
 
 
-def _legend(figure: Figure, width: float, height: float) -> None:
+def _legend(figure: Figure, names: Sequence[str], width: float, height: float) -> None:
     left, line = 0.25 / width, 1 - 0.52 / height
-    for number, (name, color) in enumerate(zip(ACTION_NAMES, ACTION_COLORS, strict=True)):
-        figure.text(left + number * 0.36 / width, line, f"■ {name}", fontsize=7.5, color=color, va="center")
+    for number, name in enumerate(names):
+        shown, color = name.replace("phi", "φ"), ACTION_COLORS[number % len(ACTION_COLORS)]
+        figure.text(left, line, f"■ {shown}", fontsize=7.5, color=color, va="center")
+        left += (0.24 + 0.06 * len(shown)) / width
     meaning = "action in units of its limits, −1 to 1    r reward    R return (mc_return)"
-    figure.text(left + 1.52 / width, line, meaning, fontsize=7.5, color=MUTED, va="center")
+    figure.text(left + 0.08 / width, line, meaning, fontsize=7.5, color=MUTED, va="center")
 
 
 def _header(figure: Figure, strip: Strip, left: float, line: float) -> None:
@@ -151,9 +152,15 @@ def _cell(figure: Figure, cell: GridSpecFromSubplotSpec, strip: Strip, step: int
         bbox={"facecolor": "#000000a0", "edgecolor": "none", "pad": 1.2},
     )  # fmt: skip
     bars: Axes = figure.add_subplot(cell[1])
-    bars.bar(np.arange(4), record["action"], color=ACTION_COLORS, width=0.72)
+    size = len(record["action"])
+    bars.bar(
+        np.arange(size),
+        record["action"],
+        color=[ACTION_COLORS[part % len(ACTION_COLORS)] for part in range(size)],
+        width=0.72,
+    )
     bars.axhline(0, color="#c5c9cf", linewidth=0.6, zorder=0)
-    bars.set(xlim=(-0.9, 3.9), ylim=(-1.08, 1.08), xticks=[], yticks=[])
+    bars.set(xlim=(-0.9, size - 0.1), ylim=(-1.08, 1.08), xticks=[], yticks=[])
     bars.set_frame_on(False)
     label: Axes = figure.add_subplot(cell[2])
     label.axis("off")

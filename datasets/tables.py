@@ -1,58 +1,97 @@
-"""Episodes to Arrow tables: the steps of a block with their labels, and one row per episode.
+"""Episodes to Arrow tables, and the Parquet settings of both: a row per step, a row per episode.
 
-The way back is `dataset`. Dimension key: N rows, T steps of an episode, A = 4 action.
+The image column is raw RGB: with zstd that is smaller than PNG and decodes ten times as fast (DESIGN, section 3).
 """
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from graspq.datasets import columns
+from graspq.datasets.columns import Column, sizes_of
 from graspq.datasets.episode import Episode
-from graspq.datasets.labels import mc_return, synthetic_action
 from graspq.datasets.manifest import Manifest
-from graspq.datasets.schema import episodes_schema, steps_schema
+
+COMPRESSION_LEVEL = 6
+
+
+def steps_schema(manifest: Manifest) -> pa.Schema:
+    """Return the schema of the steps table: one row per step, one row group per block.
+
+    The metadata of the schema and of the fields say what the numbers mean; they depend on `manifest` alone.
+    """
+    return _schema(manifest, "steps", columns.STEPS)
+
+
+def episodes_schema(manifest: Manifest) -> pa.Schema:
+    """Return the schema of the episodes table: one row per episode."""
+    return _schema(manifest, "episodes", columns.EPISODES)
+
+
+def parquet_settings(schema: pa.Schema) -> dict[str, Any]:
+    """Return the writer's settings: zstd, page checksums, no dictionaries, no statistics on images."""
+    return {
+        "compression": "zstd",
+        "compression_level": COMPRESSION_LEVEL,
+        "use_dictionary": False,
+        "write_statistics": [name for name in schema.names if pa.types.is_integer(schema.field(name).type)],
+        "write_page_checksum": True,
+        "version": "2.6",
+        "data_page_version": "1.0",
+    }
 
 
 def steps_table(manifest: Manifest, episodes: Sequence[Episode]) -> pa.Table:
-    """Return the steps of `episodes`, in their order, with labels; columns as in `schema.steps_schema`."""
+    """Return the steps of `episodes`, in their order, with labels; columns as in `steps_schema`."""
     schema = steps_schema(manifest)
-    limits, discount = manifest.action_limits, manifest.discount
-    columns: dict[str, Any] = {
-        "episode_id": np.repeat([e.episode_id for e in episodes], [e.steps for e in episodes]),
-        "step": np.concatenate([np.arange(e.steps) for e in episodes]),
-        "action": np.concatenate([e.actions for e in episodes]),
-        "reward": np.concatenate([e.rewards for e in episodes]),
-        "terminal": np.concatenate([np.arange(e.steps) == e.steps - 1 for e in episodes]),
-        "gripper_pose": np.concatenate([e.gripper_poses for e in episodes]),
-        "mc_return": np.concatenate([mc_return(e.rewards, discount) for e in episodes]),
-        "synthetic_action": np.concatenate([synthetic_action(e.gripper_poses, e.final_pose, limits) for e in episodes]),
-    }
-    arrays = {name: _array(values, schema.field(name).type) for name, values in columns.items()}
-    images = np.concatenate([e.images for e in episodes])
-    image_type = schema.field("image").type
-    arrays["image"] = pa.Array.from_buffers(image_type, len(images), [None, pa.py_buffer(images)])
-    return pa.Table.from_arrays([arrays[name] for name in schema.names], schema=schema)
+    values = [columns.step_values(episode, columns.episode_row(episode), manifest) for episode in episodes]
+    arrays = [
+        _array(np.concatenate([value[name] for value in values]), schema.field(name).type) for name in schema.names
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def episodes_table(manifest: Manifest, episodes: Sequence[Episode]) -> pa.Table:
-    """Return one row per episode; columns as in `schema.episodes_schema`."""
-    schema = episodes_schema(manifest)
-    rows = [
-        {
-            **{name: getattr(e, name) for name in schema.names if name not in ("object_poses", "final_pose")},
-            "object_poses": e.object_poses.tolist(),
-            "final_pose": e.final_pose.tolist(),
-            "object_ids": list(e.object_ids),
-        }
-        for e in episodes
+    """Return one row per episode; columns as in `episodes_schema`."""
+    return pa.Table.from_pylist(
+        [columns.episode_row(episode) for episode in episodes], schema=episodes_schema(manifest)
+    )
+
+
+def _schema(manifest: Manifest, table: str, described: Sequence[Column]) -> pa.Schema:
+    sizes = sizes_of(manifest.image_shape, manifest.action)
+    fields = [
+        pa.field(
+            column.name,
+            column.arrow_type(sizes),
+            nullable=column.nullable,
+            metadata={key: json.dumps(value) for key, value in column.metadata(manifest).items()} or None,
+        )
+        for column in described
     ]
-    return pa.Table.from_pylist(rows, schema=schema)
+    facts = {
+        "image_shape": list(manifest.image_shape),
+        "action_limits": list(manifest.action_limits),
+        "discount": manifest.discount,
+        **columns.phi_range(manifest),
+    }
+    metadata = {
+        "graspq.table": table,
+        "graspq.format_version": str(manifest.format_version),
+        "graspq.task": manifest.task_name,
+        **{f"graspq.{name}": json.dumps(value) for name, value in facts.items()},
+    }
+    return pa.schema(fields, metadata=metadata)
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
-    if not pa.types.is_fixed_size_list(kind):
-        return pa.array(values, kind)
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1), kind.value_type)
-    return pa.FixedSizeListArray.from_arrays(flat, type=kind)
+    """Return rows as an Arrow array; images are taken as they lie in memory."""
+    if pa.types.is_fixed_size_binary(kind):
+        return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
+    if pa.types.is_fixed_size_list(kind):
+        inner = np.ascontiguousarray(values).reshape(-1, *values.shape[2:])
+        return pa.FixedSizeListArray.from_arrays(_array(inner, kind.value_type), type=kind)
+    return pa.array(values, kind)

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.common.files import read_json, sha256_of
-from graspq.datasets.blocks import BlockArrays, BlockRef, read_block
+from graspq.datasets.blocks import BlockRef, read_block
+from graspq.datasets.columns import sizes_of, wrong_labels
 from graspq.datasets.dataset import Dataset, check_file
-from graspq.datasets.labels import mc_return, synthetic_action
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
-from graspq.datasets.schema import episodes_schema, steps_schema
+from graspq.datasets.tables import episodes_schema, steps_schema
 
 OBJECT_SET = "objects/object_set.json"
 Progress = Callable[[int], Any]
@@ -169,22 +168,12 @@ def _content(dataset: Dataset, entry: ShardEntry) -> Iterator[str]:
 
 
 def _block(manifest: Manifest, ref: BlockRef, episodes: list[dict[str, Any]]) -> Iterator[str]:
-    arrays = read_block(ref, manifest.image_shape)
+    arrays = read_block(ref, sizes_of(manifest.image_shape, manifest.action))
     if arrays.lengths.tolist() != [row["steps"] for row in episodes]:
         yield "the lengths of its episodes are not those of the episodes table"
         return
-    for number, row in enumerate(episodes):
-        yield from (f"episode {row['episode_id']}: {fault}" for fault in _episode(manifest, arrays, number, row))
-
-
-def _episode(manifest: Manifest, arrays: BlockArrays, number: int, row: dict[str, Any]) -> Iterator[str]:
-    rows = slice(int(arrays.first_rows[number]), int(arrays.first_rows[number] + arrays.lengths[number]))
-    records = arrays.records[rows]
-    if (records["episode_id"] != row["episode_id"]).any() or (records["step"] != np.arange(len(records))).any():
-        yield "its steps are out of order"
-    if not np.array_equal(records["mc_return"], mc_return(records["reward"], manifest.discount)):
-        yield "mc_return is not the return of its rewards"
-    final_pose = np.asarray(row["final_pose"], np.float32)
-    expected = synthetic_action(arrays.gripper_pose[rows], final_pose, manifest.action_limits)
-    if not np.array_equal(records["synthetic_action"], expected):
-        yield "synthetic_action is not that of its poses"
+    for row, first, length in zip(episodes, arrays.first_rows.tolist(), arrays.lengths.tolist(), strict=True):
+        records = arrays.records[first : first + length]
+        steps = {name: records[name] for name in records.dtype.names or ()}
+        for name in wrong_labels(steps, row, manifest):
+            yield f"episode {row['episode_id']}: {name} is not what its other columns give"

@@ -17,8 +17,7 @@ from graspq.common.errors import UserError
 from graspq.common.files import committed, remove_temporaries, sha256_of
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import Manifest, ShardEntry, episodes_file, shard_name, steps_file
-from graspq.datasets.schema import parquet_settings
-from graspq.datasets.tables import episodes_table, steps_table
+from graspq.datasets.tables import episodes_table, parquet_settings, steps_table
 
 
 def write_shard(
@@ -98,6 +97,9 @@ def _grouped(manifest: Manifest, first_block: int, blocks: int, episodes: Sequen
     wrong = next((episode for episode in episodes if episode.images.shape[1:] != manifest.image_shape), None)
     if wrong is not None:
         raise ValueError(f"images: expected {manifest.image_shape}, got {wrong.images.shape[1:]}")
+    size = manifest.action.size
+    if any(episode.actions.shape[1] != size for episode in episodes):
+        raise ValueError(f"actions: expected {size} parts, {', '.join(manifest.action.names)}")
     return groups
 
 

@@ -6,7 +6,7 @@ Blocks that were read are kept from round to round where all fit the buffer: onl
 import dataclasses
 from pathlib import Path
 
-from graspq.datasets.blocks import BlockArrays, BlockRef, row_bytes
+from graspq.datasets.blocks import BlockArrays, BlockRef
 from graspq.datasets.pool import ShardPool
 
 
@@ -39,7 +39,7 @@ class PoolOfRounds:
     def __init__(self, base: ShardPool, buffer_bytes: int) -> None:
         fields = [field.name for field in dataclasses.fields(base)]
         self._keeping = KeepingPool(**{name: getattr(base, name) for name in fields})
-        self._base, self._buffer_rows = base, buffer_bytes // row_bytes(base.image_shape)
+        self._base, self._buffer_rows = base, buffer_bytes // base.row_bytes
 
     def of(self, blocks: tuple[BlockRef, ...]) -> ShardPool:
         """Return the base pool with these blocks after its own; the order of samples is a function of both."""

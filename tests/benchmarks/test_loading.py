@@ -7,8 +7,6 @@ from loading import check, consume, known
 from loading_rivals import Table, _Pairs, hugging_face_map, hugging_face_stream, lerobot_style, png_files
 from streaming import larger
 
-from graspq.datasets.blocks import row_bytes
-
 BATCH = 16
 
 
@@ -56,7 +54,7 @@ def test_an_epoch_that_is_too_short_is_refused():
 def test_a_small_pool_is_named_so_often_that_a_tenth_of_it_is_enough(pool):
     wide, buffer_bytes = larger(pool, BATCH)
     assert len(wide.blocks) % len(pool.blocks) == 0
-    assert buffer_bytes == wide.rows // 10 * row_bytes(pool.image_shape)
+    assert buffer_bytes == wide.rows // 10 * pool.row_bytes
     # Two windows of 64 blocks are the least that the sampler takes.
     assert len(wide.blocks) // 10 >= 2 * 64
 

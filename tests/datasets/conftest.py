@@ -9,14 +9,19 @@ import pytest
 
 # For `drawn_data`, which holds no tests.
 sys.path.append(str(Path(__file__).parent))
-from drawn_data import LIMITS, make_dataset, make_episode, make_episodes, make_manifest
+from drawn_data import FIVE_PARTS, LIMITS, make_dataset, make_episode, make_episodes, make_manifest
 
 
 @pytest.fixture(scope="session")
 def drawn() -> SimpleNamespace:
     """The helpers of `drawn_data`."""
     return SimpleNamespace(
-        manifest=make_manifest, episode=make_episode, episodes=make_episodes, dataset=make_dataset, limits=LIMITS
+        manifest=make_manifest,
+        five_parts=FIVE_PARTS,
+        episode=make_episode,
+        episodes=make_episodes,
+        dataset=make_dataset,
+        limits=LIMITS,
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspq.common.action_space import grasping
+from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.files import sha256_of, write_json, write_text
 from graspq.common.seeding import generator
 from graspq.datasets.card import write_card
@@ -16,20 +16,37 @@ from graspq.datasets.writer import commit_shard, write_shard
 LIMITS = (0.06, 0.06, 0.05, 0.7)
 
 
-def make_manifest(size: int = 8, block_size: int = 2, discount: float = 1.0, task: str = "regular") -> Manifest:
+# A robot that cannot turn its wrist but tilts and closes its hand, in a scene without a mirror plane.
+FIVE_PARTS = ActionSpace(
+    names=("dx", "dy", "dz", "tilt", "close"),
+    pose=("x", "y", "z", "angle", "width"),
+    units=("m", "m", "m", "rad", "m"),
+    limits=(0.06, 0.06, 0.05, 0.3, 0.02),
+    mirror=None,
+    start=(0.0, 0.0, -1.0, 0.0, 0.0),
+)
+
+
+def make_manifest(
+    size: int = 8,
+    block_size: int = 2,
+    discount: float = 1.0,
+    task: str = "regular",
+    action: ActionSpace | None = None,
+) -> Manifest:
     return Manifest(
         task={"name": task, "max_steps": 15},
         settings={"seed": 0, "block_size": block_size},
         versions={"graspq": "0"},
         object_set={"name": "drawn", "sha256": "0" * 64},
         image_shape=(size, size, 3),
-        action=grasping(LIMITS),
+        action=grasping(LIMITS) if action is None else action,
         discount=discount,
-        phi_range=(-2.9, 2.9),
+        phi_range=(-2.9, 2.9) if action is None else None,
     )
 
 
-def make_episode(index: int, block_size: int = 2, size: int = 8) -> Episode:
+def make_episode(index: int, block_size: int = 2, size: int = 8, parts: int = 4) -> Episode:
     rng = generator("tests/episode", index)
     steps = int(rng.integers(1, 9))
     y, x = np.mgrid[0:size, 0:size]
@@ -41,7 +58,7 @@ def make_episode(index: int, block_size: int = 2, size: int = 8) -> Episode:
     success = bool(rng.random() < 0.4)
     rewards = np.zeros(steps, np.float32)
     rewards[-1] = success
-    poses = rng.normal(0.3, 0.2, (steps + 1, 4)).astype(np.float32)
+    poses = rng.normal(0.3, 0.2, (steps + 1, parts)).astype(np.float32)
     return Episode(
         episode_id=index,
         block=index // block_size,
@@ -49,7 +66,7 @@ def make_episode(index: int, block_size: int = 2, size: int = 8) -> Episode:
         object_ids=("train_001", f"train_{index:03d}"),
         object_poses=rng.normal(size=(2, 7)).astype(np.float32),
         images=images,
-        actions=rng.uniform(-1, 1, (steps, 4)).astype(np.float32),
+        actions=rng.uniform(-1, 1, (steps, parts)).astype(np.float32),
         rewards=rewards,
         gripper_poses=poses[:-1],
         final_pose=poses[-1],
@@ -61,19 +78,26 @@ def make_episode(index: int, block_size: int = 2, size: int = 8) -> Episode:
     )
 
 
-def make_episodes(first_block: int, blocks: int, block_size: int = 2, size: int = 8) -> list[Episode]:
+def make_episodes(first_block: int, blocks: int, block_size: int = 2, size: int = 8, parts: int = 4) -> list[Episode]:
     first = first_block * block_size
-    return [make_episode(index, block_size, size) for index in range(first, first + blocks * block_size)]
+    return [make_episode(index, block_size, size, parts) for index in range(first, first + blocks * block_size)]
 
 
 def make_dataset(
-    folder: Path, blocks: int = 12, per_shard: int = 5, block_size: int = 2, size: int = 8, discount: float = 1.0
+    folder: Path,
+    blocks: int = 12,
+    per_shard: int = 5,
+    block_size: int = 2,
+    size: int = 8,
+    discount: float = 1.0,
+    action: ActionSpace | None = None,
 ) -> Manifest:
     """Write a dataset of real shards, with an object set and a card, and return its manifest."""
-    manifest = dataclasses.replace(make_manifest(size, block_size, discount), object_set=make_objects(folder))
+    manifest = make_manifest(size, block_size, discount, action=action)
+    manifest = dataclasses.replace(manifest, object_set=make_objects(folder))
     for first in range(0, blocks, per_shard):
         count = min(per_shard, blocks - first)
-        episodes = make_episodes(first, count, block_size, size)
+        episodes = make_episodes(first, count, block_size, size, manifest.action.size)
         manifest = commit_shard(folder, manifest, write_shard(folder, manifest, first, count, episodes))
     return write_card(folder, manifest)
 

@@ -4,9 +4,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from graspq.datasets.card import EPISODES_FEATURES, STEPS_FEATURES, card_text
+from graspq.datasets.card import card_text
+from graspq.datasets.columns import EPISODES, STEPS
 from graspq.datasets.manifest import Manifest
-from graspq.datasets.schema import episodes_schema, steps_schema
+from graspq.datasets.tables import episodes_schema, steps_schema
 
 
 @pytest.fixture
@@ -40,6 +41,8 @@ def test_the_header_declares_the_columns_of_the_schemas(dataset, header):
     assert declared == steps_schema(manifest).names + episodes_schema(manifest).names
     start = header.index("  - name: action")
     assert header[start + 1 : start + 3] == ["    list: float32", "    length: 4"]
+    start = header.index("  - name: object_poses")
+    assert header[start + 1 : start + 4] == ["    list:", "      list: float32", "      length: 7"]
 
 
 @pytest.mark.parametrize(("rows", "category"), [(999, "n<1K"), (1000, "1K<n<10K"), (5_600_000, "1M<n<10M")])
@@ -51,4 +54,4 @@ def test_the_size_category_follows_the_rows(dataset, rows, category):
 
 def test_every_column_is_described(dataset):
     text = card_text(Manifest.load(dataset)).split("---\n")[2]
-    assert [name for name in (*STEPS_FEATURES, *EPISODES_FEATURES) if f"`{name}`" not in text] == []
+    assert [column.name for column in (*STEPS, *EPISODES) if f"| `{column.name}` |" not in text] == []

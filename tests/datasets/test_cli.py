@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from graspq.datasets.cli import main, size
+from graspq.datasets.cli import main
 from graspq.datasets.manifest import Manifest
 
 
@@ -80,7 +80,3 @@ def test_the_installed_command_starts_without_matplotlib_and_torch(dataset, tmp_
     command = Path(sys.executable).with_name("grasp-data")
     done = subprocess.run([command, "--version"], capture_output=True, text=True, cwd=tmp_path, check=True)
     assert "graspq" in done.stdout
-
-
-def test_sizes_are_written_as_people_read_them():
-    assert [size(value) for value in (0, 1023, 1536, 5 * 2**30)] == ["0 B", "1023 B", "1.5 KiB", "5.0 GiB"]

@@ -6,7 +6,6 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.blocks import row_bytes
 from graspq.datasets.dataset import open_shards
 from graspq.datasets.loader import EpisodeLoader, TransitionLoader, episode_batches, transition_batches
 
@@ -21,7 +20,7 @@ def pool(many_blocks):
 @pytest.fixture(scope="module")
 def small_buffer(pool):
     """Room for a little less than the pool, so that it streams in windows, of which one is read ahead."""
-    return int(pool.rows * row_bytes(SHAPE) * 0.99)
+    return int(pool.rows * pool.row_bytes * 0.99)
 
 
 def take(loader, count):
@@ -42,7 +41,7 @@ def test_every_transition_is_the_one_that_was_collected(pool, drawn):
     for index in range(64):
         episode, step = episodes[batch.episode_id[index]], batch.step[index]
         last = step == episode.steps - 1
-        assert batch.terminal[index] == batch.last[index] == last
+        assert batch.terminal[index] == last
         assert np.array_equal(batch.image[index], episode.images[step])
         assert np.array_equal(batch.next_image[index], episode.images[step if last else step + 1])
         assert batch.next_step[index] == (step if last else step + 1)
@@ -57,10 +56,12 @@ def test_every_transition_is_the_one_that_was_collected(pool, drawn):
 def test_batches_have_the_stated_types(pool):
     with TransitionLoader(pool, 16, 0) as loader:
         batch = next(loader)
-    kinds = {name: str(getattr(batch, name).dtype) for name in batch.__dataclass_fields__}
+    kinds = {name: str(array.dtype) for name, array in batch.arrays().items()}
     assert {kinds[name] for name in ("image", "next_image")} == {"uint8"}
     assert {kinds[name] for name in ("step", "next_step", "episode_id", "block")} == {"int64"}
-    assert {kinds[name] for name in ("action", "reward", "mc_return", "synthetic_action")} == {"float32"}
+    assert {kinds[name] for name in ("action", "reward", "gripper_pose", "mc_return", "synthetic_action")} == {
+        "float32"
+    }
     assert kinds["terminal"] == "bool"
     assert all(getattr(batch, name).flags.c_contiguous and getattr(batch, name).flags.writeable for name in kinds)
 

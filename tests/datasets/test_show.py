@@ -44,7 +44,7 @@ def test_an_outcome_that_never_happened_is_said(drawn, tmp_path):
 
 def test_every_frame_is_drawn_with_its_reward_and_return(dataset):
     strips = choose_strips(Dataset.open(dataset), 3, 0)
-    figure = draw_strips(strips, "regular grasping")
+    figure = draw_strips(strips, ("dx", "dy", "dz", "dphi"), "regular grasping")
     frames = [image for axes in figure.axes for image in axes.images]
     assert len(frames) == sum(len(strip.images) for strip in strips)
     texts = [text.get_text() for axes in figure.axes for text in axes.texts]
@@ -54,8 +54,8 @@ def test_every_frame_is_drawn_with_its_reward_and_return(dataset):
 
 def test_the_picture_is_a_png_and_a_place_that_cannot_be_written_is_named(dataset, tmp_path):
     strips = choose_strips(Dataset.open(dataset), 2, 0)
-    save_strips(tmp_path / "new/strip.png", strips, "regular")
+    save_strips(tmp_path / "new/strip.png", strips, ("dx", "dy", "dz", "dphi"), "regular")
     assert matplotlib.image.imread(tmp_path / "new/strip.png").std() > 0.05
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write the picture"):
-        save_strips(tmp_path / "file/strip.png", strips, "regular")
+        save_strips(tmp_path / "file/strip.png", strips, ("dx", "dy", "dz", "dphi"), "regular")

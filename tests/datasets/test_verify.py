@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.datasets import tables
+from graspq.datasets import columns
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.verify import verify
 from graspq.datasets.writer import commit_shard, write_shard
@@ -91,10 +91,11 @@ def test_blocks_that_are_not_there_yet_are_noted(new_dataset):
 @pytest.mark.parametrize("label", ["mc_return", "synthetic_action"])
 def test_a_label_that_is_not_that_of_its_rewards_and_poses_is_a_fault(drawn, tmp_path, monkeypatch, label):
     drawn.dataset(tmp_path, blocks=1)
-    right = getattr(tables, label)
-    monkeypatch.setattr(tables, label, lambda *arguments: right(*arguments) + np.float32(1e-3))
+    right = getattr(columns, label)
     manifest = Manifest.load(tmp_path)
-    commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 1, drawn.episodes(0, 1)))
+    with monkeypatch.context() as patch:
+        patch.setattr(columns, label, lambda *arguments: right(*arguments) + np.float32(1e-3))
+        commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 1, drawn.episodes(0, 1)))
     faults = verify(tmp_path).faults
     assert len(faults) == 2
     assert all(label in fault and "block 0: episode" in fault for fault in faults)

@@ -1,6 +1,7 @@
 import dataclasses
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -33,7 +34,7 @@ def test_what_is_read_is_what_was_written(dataset, drawn):
             assert np.array_equal(arrays.images[span], episode.images)
             assert np.array_equal(arrays.records["action"][span], episode.actions)
             assert np.array_equal(arrays.records["reward"][span], episode.rewards)
-            assert np.array_equal(arrays.gripper_pose[span], episode.gripper_poses)
+            assert np.array_equal(arrays.records["gripper_pose"][span], episode.gripper_poses)
             assert arrays.records["terminal"][span].tolist() == [False] * (episode.steps - 1) + [True]
             row = rows[episode.episode_id]
             for name in ("episode_id", "block", "seed", "steps", "end", "success", "lifted_object", "exploration"):
@@ -86,7 +87,9 @@ def test_episodes_that_are_not_those_of_the_blocks_are_refused(drawn, tmp_path):
 def test_a_full_disk_gives_one_line_with_folder_and_bytes_and_leaves_nothing(drawn, tmp_path):
     (tmp_path / "shards").mkdir()
     # Every write to /dev/full fails with ENOSPC: the real error, without a full disk.
-    (tmp_path / f"shards/.tmp-{os.getpid()}-blocks-000000-000001.parquet").symlink_to("/dev/full")
+    (tmp_path / f"shards/.tmp-{socket.gethostname()}-{os.getpid()}-blocks-000000-000001.parquet").symlink_to(
+        "/dev/full"
+    )
     with pytest.raises(UserError, match=r"disk is full; this shard needs [\d,]{4,} bytes") as caught:
         write_shard(tmp_path, drawn.manifest(), 0, 2, drawn.episodes(0, 2))
     assert str(tmp_path) in caught.value.message

@@ -4,7 +4,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from graspq.datasets.schema import steps_schema
+from graspq.datasets.tables import steps_schema
 
 
 @pytest.fixture
