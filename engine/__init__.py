@@ -1,1 +1,7 @@
 """Units of work on processes of this machine or on a Ray cluster: the only place that starts processes."""
+
+from graspq.engine.running import run
+from graspq.engine.settings import EngineSettings
+from graspq.engine.work import Place, Work
+
+__all__ = ["EngineSettings", "Place", "Work", "run"]

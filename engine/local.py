@@ -1,0 +1,151 @@
+"""Workers as processes of this machine: each an executor of one process, so that a death is that of one unit.
+
+They are spawned, not forked: a fork would copy the locks of threads and the parent's physics clients.
+"""
+
+import atexit
+import concurrent.futures
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+from graspq.engine.work import Bench, Died, Failed, Outcome
+
+_bench: Bench | None = None
+
+
+class LocalWorker:
+    """One process."""
+
+    ready = True
+
+    def __init__(self, work: bytes) -> None:
+        """Start it; it opens the pickled work with its first unit."""
+        context = multiprocessing.get_context("spawn")
+        self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(work,))
+        before = set(multiprocessing.active_children())
+        with _interrupts_blocked():
+            self._executor.submit(int)  # the executor starts its process with the first thing to do
+        self._processes = set(multiprocessing.active_children()) - before
+
+    def submit(self, unit: Any) -> "Future[Outcome[Any]]":
+        """Give it a unit."""
+        return self._executor.submit(_do, unit)
+
+    def outcome(self, future: "Future[Outcome[Any]]") -> Outcome[Any]:
+        """Return what came of a unit; the worker is gone where it died."""
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            self.end()
+            codes = {process.exitcode for process in self._processes} - {None}
+            return Died(_how(next(iter(codes), None)))
+        except BaseException as error:  # such as a unit that cannot be pickled
+            return Failed(f"{type(error).__name__}: {error}")
+
+    def end(self, *, at_once: bool = False) -> None:
+        """End the process: when it is idle, or `at_once`."""
+        if at_once:
+            for process in self._processes:
+                process.kill()
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
+
+class LocalTeam:
+    """Processes of this machine; see `schedule.Team`."""
+
+    def __init__(self, work: bytes) -> None:
+        """Hire nobody yet; `work` is pickled."""
+        self._work = work
+        self._workers: list[LocalWorker] = []
+        self._busy: dict[Future[Outcome[Any]], LocalWorker] = {}
+
+    def hire(self) -> LocalWorker:
+        """Start a process."""
+        worker = LocalWorker(self._work)
+        self._workers.append(worker)
+        return worker
+
+    def give(self, worker: LocalWorker, unit: Any) -> bool:
+        """Give a unit to an idle worker; return False where it has died."""
+        try:
+            self._busy[worker.submit(unit)] = worker
+        except BrokenProcessPool:
+            self.dismiss(worker)
+            return False
+        return True
+
+    def wait(self) -> list[tuple[LocalWorker, Outcome[Any] | None]]:
+        """Wait until a unit is done or its worker has died."""
+        finished, _ = concurrent.futures.wait(self._busy, return_when=concurrent.futures.FIRST_COMPLETED)
+        heard: list[tuple[LocalWorker, Outcome[Any] | None]] = []
+        for future in finished:
+            worker = self._busy.pop(future)
+            outcome = worker.outcome(future)
+            if isinstance(outcome, Died):
+                self._workers.remove(worker)
+            heard.append((worker, outcome))
+        return heard
+
+    def dismiss(self, worker: LocalWorker) -> None:
+        """End an idle worker."""
+        self._workers.remove(worker)
+        worker.end()
+
+    def close(self) -> None:
+        """Kill all that still work, and end the others."""
+        busy = set(self._busy.values())
+        for worker in self._workers:
+            worker.end(at_once=worker in busy)
+        self._workers, self._busy = [], {}
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT: a process that is started now never sees a Ctrl-C, which is for the parent to answer."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _how(exit_code: int | None) -> str:
+    if exit_code is None:
+        return "its process ended"
+    if exit_code < 0:
+        return f"killed by {signal.Signals(-exit_code).name}"
+    return f"exit code {exit_code}"
+
+
+def _begin(work: bytes) -> None:
+    """Begin a worker process."""
+    global _bench
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.path.append(str(Path.cwd()))  # for modules that the user names, at the end so that none is shadowed
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _bench = Bench(lambda: pickle.loads(work), lambda folder: folder)
+    atexit.register(_bench.close)
+
+
+def _end_with_parent() -> None:
+    """End this process when the parent is gone, however: its executor would wait for units for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
+
+
+def _do(unit: Any) -> Outcome[Any]:
+    assert _bench is not None
+    return _bench.do(unit)

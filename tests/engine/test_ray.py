@@ -1,0 +1,81 @@
+"""Workers on a Ray cluster of two nodes on this machine, and on a Ray of this machine's own."""
+
+import logging
+import signal
+import time
+
+import pytest
+from ending import end_in_the_middle
+from units_of_work import ReadsFolder, Squares
+
+from graspq.common.errors import UserError
+from graspq.engine import EngineSettings, run
+
+pytest.importorskip("ray")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two nodes of one core each, the first of which is the caller's."""
+    from ray.cluster_utils import Cluster
+
+    logging.disable(logging.WARNING)
+    patient = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": patient})
+    made.add_node(num_cpus=1)
+    yield made
+    made.shutdown()
+    logging.disable(logging.NOTSET)
+
+
+@pytest.fixture
+def on_cluster(cluster):
+    return EngineSettings(engine="ray", ray_address=cluster.address)
+
+
+def test_units_come_back_with_the_results_of_the_local_engine_and_deaths_are_dealt_with(on_cluster, tmp_path):
+    results = []
+    with pytest.raises(UserError, match=r"^unit 'die' \(its process ended\) ended its worker twice; all else is done"):
+        for unit, result in run(
+            Squares(), [1, ("die once", str(tmp_path / "mark")), "die", *range(2, 9)], on_cluster,
+            name=lambda unit: f"unit {unit!r}", units_per_worker=4,
+        ):  # fmt: skip
+            results.append((unit, result))
+    assert sorted(result for _, result in results) == [0, *(number**2 for number in range(1, 9))]
+
+
+def test_mistakes_and_defects_are_those_of_the_local_engine(on_cluster):
+    with pytest.raises(UserError) as raised:
+        list(run(Squares(), ["mistake"], on_cluster))
+    assert raised.value.message == "--size: a mistake of the user's; choose another"
+    with pytest.raises(RuntimeError, match=r"(?s)unit defect failed.*in square.*ZeroDivisionError: deep in a worker"):
+        list(run(Squares(), ["defect"], on_cluster, name=lambda unit: f"unit {unit}"))
+
+
+def test_a_node_elsewhere_reads_its_own_copy_of_a_folder(on_cluster, tmp_path, monkeypatch):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "a").write_text(f"content {time.time()}")
+    results = [result for _, result in run(ReadsFolder(folder), ["a"] * 4, on_cluster)]
+    assert {text for _, text, _ in results} == {(folder / "a").read_text()}
+    places = {place for place, _, _ in results}
+    assert str(folder) in places and len(places) == 2
+
+
+def test_units_of_a_node_that_is_killed_are_done_on_those_that_remain(cluster, on_cluster):
+    results, units = [], [("sleep", 0.1 * number) for number in range(10)]
+    for unit, _ in run(Squares(), units, on_cluster):
+        results.append(unit)
+        if len(results) == 3:
+            cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+    assert sorted(results) == units
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://nowhere", "nonsense"])
+def test_an_address_without_a_cluster_is_one_line(address):
+    with pytest.raises(UserError, match=rf"--ray-address: no cluster at '{address}'.*expected HOST:PORT or auto"):
+        list(run(Squares(), [1], EngineSettings(engine="ray", ray_address=address)))
+
+
+def test_nothing_is_left_of_a_ray_whose_process_is_killed(tmp_path_factory):
+    end_in_the_middle("ray", signal.SIGKILL, tmp_path_factory.mktemp("r"))
