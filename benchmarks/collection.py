@@ -7,6 +7,7 @@ Ours is what `grasp-datagen` runs in a worker, block by block, and the writing o
 actions, with probability 0.9 straight down. Each has a process of its own; they take turns.
 """
 
+import contextlib
 import itertools
 import multiprocessing
 import statistics
@@ -25,8 +26,9 @@ from tallies import Tally
 from timing import median_ratio, report, take_turns
 
 from graspq.common.options import Command
-from graspq.datagen import workers as pool
+from graspq.datagen.collect import BLOCKS_PER_WORKER, Block, Collection, collected
 from graspq.datagen.settings import CollectionSettings
+from graspq.engine import EngineSettings, run
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
 
@@ -103,18 +105,19 @@ def pool_seconds(objects: Path, seed: int, team: int, blocks: int) -> float:
     """
     settings = CollectionSettings(seed=seed)
     # More blocks than are waited for: no worker is idle before the clock stops.
-    jobs = [pool.BlockJob(block, settings.block_size) for block in range(team * (blocks + 3))]
+    size = settings.block_size
+    units = [Block(number, size, number * size) for number in range(team * (blocks + 3))]
     with tempfile.TemporaryDirectory() as folder:
         shards = ours.Shards(folder, objects, settings)
-        collected = pool.collect_blocks(jobs, ours.TASK, objects, settings, team)
-        for _ in itertools.islice(collected, team):
-            pass
-        start = time.perf_counter()
-        done = [episodes for _, episodes in itertools.islice(collected, team * blocks)]
-        for episodes in done:
-            shards.add(episodes)
-        seconds = time.perf_counter() - start
-        collected.close()  # type: ignore[attr-defined]
+        work = Collection(ours.TASK.settings.to_json(), objects, settings)
+        with contextlib.closing(collected(work, units, EngineSettings(workers=team))) as finished:
+            for _ in itertools.islice(finished, team):
+                pass
+            start = time.perf_counter()
+            done = [episodes for _, episodes in itertools.islice(finished, team * blocks)]
+            for episodes in done:
+                shards.add(episodes)
+            seconds = time.perf_counter() - start
     return seconds / sum(map(len, done))
 
 
@@ -146,8 +149,8 @@ def memory(objects: Path, seed: int, scenes: int) -> tuple[Rows, dict[str, Any]]
     rows = [{"bins filled": int(counts[index]), "resident MB": sizes[index] / 1e6} for index in _spread(len(counts))]
     return rows, {
         "growth, kB a bin (second half)": slope / 1e3,
-        "bins in a worker's life": pool.BLOCKS_PER_WORKER,
-        "growth in a worker's life, MB": slope * pool.BLOCKS_PER_WORKER / 1e6,
+        "bins in a worker's life": BLOCKS_PER_WORKER,
+        "growth in a worker's life, MB": slope * BLOCKS_PER_WORKER / 1e6,
         f"processes for 6 blocks with 1 worker renewed after {RENEWED_AFTER}": processes_seen(objects, seed, blocks=6),
     }
 
@@ -158,14 +161,11 @@ def _spread(count: int) -> list[int]:
 
 def processes_seen(objects: Path, seed: int, blocks: int) -> int:
     """Return how many processes a pool of one worker used, whose workers are renewed after `RENEWED_AFTER` blocks."""
-    usual, pool.BLOCKS_PER_WORKER = pool.BLOCKS_PER_WORKER, RENEWED_AFTER
-    try:
-        jobs = [pool.BlockJob(block, 1) for block in range(blocks)]
-        seen: set[int | None] = set()
-        for _ in pool.collect_blocks(jobs, ours.TASK, objects, CollectionSettings(seed=seed), 1):
-            seen |= {process.pid for process in multiprocessing.active_children()}
-    finally:
-        pool.BLOCKS_PER_WORKER = usual
+    work = Collection(ours.TASK.settings.to_json(), objects, CollectionSettings(seed=seed))
+    units = [Block(number, 1, number) for number in range(blocks)]
+    seen: set[int | None] = set()
+    for _ in run(work, units, EngineSettings(workers=1), units_per_worker=RENEWED_AFTER):
+        seen |= {process.pid for process in multiprocessing.active_children()}
     return len(seen)
 
 

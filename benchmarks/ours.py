@@ -13,7 +13,7 @@ from phases import Stopwatch
 from tallies import Tally
 
 from graspq.datagen.collect import collect_block
-from graspq.datagen.run import describe
+from graspq.datagen.making import describe
 from graspq.datagen.settings import CollectionSettings, DatagenSettings
 from graspq.datasets import writer
 from graspq.datasets.episode import Episode

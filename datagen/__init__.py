@@ -1,1 +1,1 @@
-"""Collection of random-policy grasps into a dataset: blocks as pure functions, a plan of shards, local execution."""
+"""Collection of random-policy grasps into a dataset: blocks as pure functions, a plan of shards."""

@@ -1,16 +1,82 @@
-"""One block of episodes as a pure function of the dataset's settings and the block's number.
+"""One block of episodes as a pure function of the dataset's settings and the block's number: the engine's unit.
 
 A block is 20 episodes that share their objects; it starts from an emptied world, so it gives the same bytes alone,
-after any other blocks, and in any process. Dimension key: T steps of an episode, H W C image.
+after any other blocks, and in any process.
 """
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from graspq.common.seeding import generator, integer_seed
 from graspq.datagen.settings import CollectionSettings
 from graspq.datasets.episode import Episode
+from graspq.engine import EngineSettings, Place, run
+from graspq.objects.object_set import ObjectSet
 from graspq.sim.episode import GraspSimulation
 from graspq.sim.play import Policy, play
+from graspq.sim.task import task_from_json
+
+BLOCKS_PER_WORKER = 500  # the simulator leaks shapes; see RESULTS.md for how much
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """A block to collect.
+
+    Attributes:
+        number: from 0; it determines the objects.
+        episodes: how many, 1 .. block_size; a shorter block is the beginning of the longer one.
+        first_episode: number of its first episode, which determines the scene.
+    """
+
+    number: int
+    episodes: int
+    first_episode: int
+
+    def __str__(self) -> str:
+        return f"block {self.number}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Collection:
+    """How blocks are collected; the `Work` of a collection.
+
+    Attributes:
+        task: settings of the task, as in a manifest.
+        objects: folder of the object set.
+        settings: what determines the episodes.
+        make_policy: makes who acts, in each worker; the random policy of the settings where it is None.
+    """
+
+    task: dict[str, Any]
+    objects: Path
+    settings: CollectionSettings
+    make_policy: Callable[[], Policy] | None = None
+
+    def folders(self) -> Sequence[Path]:
+        """Return the object set's folder."""
+        return [self.objects]
+
+    @contextlib.contextmanager
+    def open(self, place: Place) -> Iterator[Callable[[Block], list[Episode]]]:
+        """Hold one simulation."""
+        policy = self.make_policy() if self.make_policy is not None else None
+        with GraspSimulation(task_from_json(self.task), ObjectSet.load(place(self.objects))) as simulation:
+            yield lambda block: collect_block(
+                simulation, self.settings, block.number, block.episodes, policy, block.first_episode
+            )
+
+
+def collected(
+    collection: Collection, blocks: Iterable[Block], engine: EngineSettings
+) -> Generator[tuple[Block, list[Episode]], None, None]:
+    """Yield each block with its episodes, in any order; see `graspq.engine.run`."""
+    return run(collection, blocks, engine, units_per_worker=BLOCKS_PER_WORKER)
 
 
 def collect_block(

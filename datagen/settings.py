@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from graspq.common.options import Settings, parse_count, setting
+from graspq.engine import EngineSettings
 from graspq.policies.random import RandomPolicy
 from graspq.sim.task import EPISODES_PER_BIN
 
@@ -12,7 +13,7 @@ BLOCKS_PER_SHARD = 50
 
 
 @dataclasses.dataclass(frozen=True)
-class DatagenSettings(Settings):
+class DatagenSettings(EngineSettings):
     """Options of `grasp-datagen`."""
 
     task: str = setting("regular", help="task to collect: regular, targeted, or your own as module:task")
@@ -24,7 +25,6 @@ class DatagenSettings(Settings):
         None, help="folder of an object set; if not given, the task's own, which is made once in the user's cache"
     )
     seed: int = setting(0, help="seed of the dataset; with it every byte is determined", minimum=0)
-    workers: int | None = setting(None, help="processes that simulate; the number of cores if not given", minimum=1)
     descend_probability: float = setting(
         0.9, help="probability that a random action moves straight down (dz = -1)", minimum=0.0, maximum=1.0
     )

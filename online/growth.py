@@ -7,7 +7,7 @@ again, one that is in the manifest never is.
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,22 @@ import torch
 
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
-from graspq.common.machine import available_cores
 from graspq.common.provenance import versions
 from graspq.common.seeding import integer_seed
-from graspq.datagen.plan import check_disk
-from graspq.datagen.run import VERSIONS
+from graspq.datagen.collect import Block, Collection, collected
+from graspq.datagen.making import VERSIONS
 from graspq.datagen.settings import CollectionSettings
-from graspq.datagen.workers import BlockJob, PolicyMaker, collect_blocks
+from graspq.datagen.shards import check_disk
 from graspq.datasets.blocks import BlockRef
 from graspq.datasets.card import write_card
 from graspq.datasets.dataset import Dataset
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
+from graspq.engine import EngineSettings
 from graspq.objects.object_set import ObjectSet
 from graspq.online.plan import Plan
+from graspq.sim.play import Policy
 from graspq.sim.task import Task
 
 DATASET = "dataset"
@@ -45,11 +46,11 @@ def collection_settings(plan: Plan) -> CollectionSettings:
     return dataclasses.replace(settings, blocks_per_shard=math.ceil(plan.online.grasps / settings.block_size))
 
 
-def round_jobs(settings: CollectionSettings, grasps: int, number: int) -> list[BlockJob]:
+def round_blocks(settings: CollectionSettings, grasps: int, number: int) -> list[Block]:
     """Return the blocks of round `number`, from 0: whole ones, and a short last one where there is a rest."""
     size, blocks = settings.block_size, settings.blocks_per_shard
     return [
-        BlockJob(number * blocks + index, min(size, grasps - index * size), number * grasps + index * size)
+        Block(number * blocks + index, min(size, grasps - index * size), number * grasps + index * size)
         for index in range(blocks)
     ]
 
@@ -64,7 +65,7 @@ class GrowingDataset:
         task: of the run.
         collection: what determines the scenes.
         grasps: of a round.
-        workers: processes that simulate.
+        engine: where workers simulate.
         blocks: of each finished round.
     """
 
@@ -73,7 +74,7 @@ class GrowingDataset:
     task: Task
     collection: CollectionSettings
     grasps: int
-    workers: int
+    engine: EngineSettings
     blocks: list[tuple[BlockRef, ...]]
 
     @classmethod
@@ -99,8 +100,7 @@ class GrowingDataset:
         check_disk(folder, plan.online.rounds * plan.online.grasps - manifest.episodes)
         objects.copy_to(folder / "objects")
         manifest.save(folder)
-        workers = plan.online.workers if plan.online.workers is not None else available_cores()
-        growing = cls(folder, manifest, task, collection, plan.online.grasps, workers, [])
+        growing = cls(folder, manifest, task, collection, plan.online.grasps, plan.online.where, [])
         for number, entry in enumerate(manifest.shards):
             growing._require_round(number, entry)
             growing._take_up(entry)
@@ -108,7 +108,7 @@ class GrowingDataset:
             growing.manifest = write_card(folder, manifest)  # a killed writer may have left the one of the round before
         return growing
 
-    def collect(self, number: int, make_policy: PolicyMaker) -> ShardEntry:
+    def collect(self, number: int, make_policy: Callable[[], Policy]) -> ShardEntry:
         """Return the shard of round `number`, from 0, which is collected and committed if it is not there.
 
         Args:
@@ -120,13 +120,12 @@ class GrowingDataset:
         """
         if number < len(self.blocks):
             return self.manifest.shards[number]
-        jobs = round_jobs(self.collection, self.grasps, number)
-        team = min(self.workers, len(jobs))
-        with _threads_kept():
-            found = collect_blocks(jobs, self.task, self.folder / "objects", self.collection, team, make_policy)
-            by_block = {job.block: episodes for job, episodes in found}
-        episodes = [episode for job in jobs for episode in by_block[job.block]]
-        entry = write_shard(self.folder, self.manifest, jobs[0].block, len(jobs), episodes)
+        blocks = round_blocks(self.collection, self.grasps, number)
+        work = Collection(self.task.settings.to_json(), self.folder / "objects", self.collection, make_policy)
+        with _threads_kept(), contextlib.closing(collected(work, blocks, self.engine)) as found:
+            by_block = dict(found)
+        episodes = [episode for block in blocks for episode in by_block[block]]
+        entry = write_shard(self.folder, self.manifest, blocks[0].number, len(blocks), episodes)
         self.manifest = write_card(self.folder, commit_shard(self.folder, self.manifest, entry))
         self._take_up(entry)
         return entry

@@ -8,13 +8,15 @@ import typing
 from pathlib import Path
 from typing import Any
 
-from graspq.common.options import Settings, parse_count, setting
+from graspq.common.options import parse_count, setting
+from graspq.engine import EngineSettings
+from graspq.engine.settings import ENGINE_OPTIONS
 from graspq.evaluate.settings import CemSettings
 from graspq.train.selection import Answer
 from graspq.train.settings import TrainOptions, TrainSettings
 
 # They may differ when a run is resumed: they do not decide what is collected.
-FREE_SETTINGS = frozenset({"start", "checkpoint", "workers", "objects"})
+FREE_SETTINGS = ENGINE_OPTIONS | {"start", "checkpoint", "objects"}
 
 _HELP = {
     "algo": "Estimator; that of the start run where it is not given.",
@@ -38,7 +40,7 @@ FIXED_BY_START = ("algo", "preset", "network", "width", "loss")
 
 
 @dataclasses.dataclass(frozen=True)
-class OnlineSettings(Settings):
+class OnlineSettings(EngineSettings):
     """What `grasp-online` has beside the settings of training; see each field's help.
 
     Source: Quillen et al. 2018, section "Experimental Results", on-policy: 50 grasps each 1,000 steps. The exploration
@@ -81,11 +83,6 @@ class OnlineSettings(Settings):
     )
     objects: Path | None = setting(
         None, help="Folder of the object set; the one that the base pool was made with where it is not given."
-    )
-    workers: int | None = setting(
-        None,
-        help="Simulator processes, all cores where not given, 0 for the training process itself; changes no grasp.",
-        minimum=0,
     )
 
     @property

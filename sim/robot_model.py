@@ -1,15 +1,13 @@
 """The Panda of pybullet_data, made light: symmetrised low-polygon hulls to look at, boxes for finger collision.
 
 The original meshes cost ten times the time of all the rest of a frame, and their small asymmetries would break the
-mirror symmetry of the scene. The model is derived once a process into a temporary folder, by a deterministic rule.
+mirror symmetry of the scene. The model is derived by a deterministic rule, once, into the user's cache.
 """
 
-import atexit
 import functools
+import hashlib
 import math
 import re
-import shutil
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -17,6 +15,10 @@ import numpy as np
 import pybullet_data
 import trimesh
 
+from graspq.common.files import cache_folder, committed_folder
+from graspq.common.provenance import versions
+
+URDF_NAME = "panda.urdf"
 ARM_JOINTS = (0, 1, 2, 3, 4, 5, 6)
 HAND_LINK = 8
 FINGER_LINKS = (9, 10)
@@ -48,28 +50,44 @@ _SYMMETRY = {
 
 @functools.cache
 def panda_urdf(*, whole: bool = False) -> Path:
-    """Return the path of the light Panda's URDF; made on the first call in this process, removed at its exit.
+    """Return the path of the light Panda's URDF; made on the first call on this machine.
 
     Args:
         whole: give the links that the camera never sees something to look at too, for a window.
     """
-    folder = Path(tempfile.mkdtemp(prefix="graspq-panda-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     source = Path(pybullet_data.getDataPath()) / "franka_panda"
+    hidden = () if whole else _OUT_OF_VIEW
+    folder = cache_folder("panda", _key(source, hidden))
+    if not folder.is_dir():
+        with committed_folder(folder) as temporary:
+            _derive(source, temporary, hidden)
+    return folder / URDF_NAME
+
+
+def _key(source: Path, hidden: tuple[str, ...]) -> str:
+    """Return a digest of all that the model depends on: this rule, the original, and who computes the hulls."""
+    originals = [source / URDF_NAME, *(_original(source, name) for name in _SYMMETRY)]
+    content = b"".join(path.read_bytes() for path in (Path(__file__), *originals))
+    return hashlib.sha256(content + repr((hidden, versions("numpy", "scipy", "trimesh"))).encode()).hexdigest()
+
+
+def _original(source: Path, name: str) -> Path:
+    return source / "meshes" / "collision" / f"{name}.obj"
+
+
+def _derive(source: Path, folder: Path, hidden: tuple[str, ...]) -> None:
     for name, normals in _SYMMETRY.items():
-        mesh = trimesh.load(source / "meshes" / "collision" / f"{name}.obj", force="mesh", process=False)
+        mesh = trimesh.load(_original(source, name), force="mesh", process=False)
         _write_flat_obj(folder / f"{name}.obj", symmetric_hull(np.asarray(mesh.vertices), normals))
-    tree = ElementTree.parse(source / "panda.urdf")
+    tree = ElementTree.parse(source / URDF_NAME)
     for link in tree.getroot().iter("link"):
         _lighten(link)
-        if not whole and link.get("name", "").removeprefix("panda_") in _OUT_OF_VIEW:
+        if link.get("name", "").removeprefix("panda_") in hidden:
             for visual in link.findall("visual"):
                 link.remove(visual)
     for element in tree.getroot().findall("material"):
         tree.getroot().remove(element)
-    path = folder / "panda.urdf"
-    tree.write(path)
-    return path
+    tree.write(folder / URDF_NAME)
 
 
 def symmetric_hull(vertices: np.ndarray, normals: tuple[tuple[float, ...], ...]) -> trimesh.Trimesh:

@@ -21,10 +21,10 @@ MAY_IMPORT = {
     "datasets": {"common"},
     "train": {"datasets", "common"},
     "policies": {"sim", "train", "objects", "common"},
-    "datagen": {"policies", "sim", "objects", "datasets", "common"},
+    "datagen": {"engine", "policies", "sim", "objects", "datasets", "common"},
     "evaluate": {"policies", "sim", "objects", "train", "datasets", "common"},
     "report": {"evaluate", "train", "datasets", "objects", "common"},
-    "online": {"policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
+    "online": {"engine", "policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
     "studies": {"policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "report", "common"},
 }
 

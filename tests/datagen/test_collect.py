@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
+from graspq.common.errors import UserError
 from graspq.common.seeding import generator, integer_seed
-from graspq.datagen.collect import collect_block
+from graspq.datagen.collect import Block, Collection, collect_block, collected
 from graspq.datagen.settings import CollectionSettings
+from graspq.engine import EngineSettings
 from graspq.sim.episode import GraspSimulation
 from graspq.sim.task import TASKS
 
@@ -104,3 +106,17 @@ def test_another_seed_or_block_gives_other_objects(regular_objects, alone):
     with GraspSimulation(TASKS["regular"], regular_objects) as simulation:
         other = collect_block(simulation, CollectionSettings(seed=5, block_size=6), 5, 1)
     assert other[0].object_ids != alone[0].object_ids
+
+
+def test_a_worker_gives_the_episodes_of_this_process(regular_objects):
+    work = Collection(TASKS["regular"].settings.to_json(), regular_objects.folder, SETTINGS)
+    blocks = [Block(1, 2, 5), Block(5, 2, 30)]
+    here, there = (dict(collected(work, blocks, EngineSettings(workers=workers))) for workers in (0, 1))
+    assert all(same(here[block], there[block]) for block in blocks)
+    assert [episode.episode_id for episode in there[blocks[0]]] == [5, 6]
+
+
+def test_a_mistake_of_the_user_in_a_worker_arrives_as_one(regular_objects):
+    work = Collection(TASKS["targeted"].settings.to_json(), regular_objects.folder, SETTINGS)
+    with pytest.raises(UserError, match="'target'"):
+        list(collected(work, [Block(0, 1, 0)], EngineSettings(workers=1)))

@@ -3,11 +3,11 @@ from pathlib import Path
 import pytest
 
 from graspq.common.errors import UserError
+from graspq.datagen.collect import Block
 from graspq.datagen.settings import CollectionSettings
-from graspq.datagen.workers import BlockJob
 from graspq.datasets.dataset import open_shards
 from graspq.objects.object_set import ObjectSet
-from graspq.online.growth import GrowingDataset, collection_settings, round_jobs
+from graspq.online.growth import GrowingDataset, collection_settings, round_blocks
 from graspq.online.policy import LatestPolicy
 from graspq.policies.random import RandomPolicy
 from graspq.sim.task import TASKS
@@ -15,8 +15,8 @@ from graspq.sim.task import TASKS
 
 def test_fifty_grasps_are_two_whole_blocks_and_half_a_one_with_consecutive_episodes(make_plan, tmp_path: Path) -> None:
     settings = collection_settings(make_plan(tmp_path / "out", grasps=50))
-    assert round_jobs(settings, 50, 0) == [BlockJob(0, 20, 0), BlockJob(1, 20, 20), BlockJob(2, 10, 40)]
-    assert round_jobs(settings, 50, 3) == [BlockJob(9, 20, 150), BlockJob(10, 20, 170), BlockJob(11, 10, 190)]
+    assert round_blocks(settings, 50, 0) == [Block(0, 20, 0), Block(1, 20, 20), Block(2, 10, 40)]
+    assert round_blocks(settings, 50, 3) == [Block(9, 20, 150), Block(10, 20, 170), Block(11, 10, 190)]
 
 
 def test_scenes_are_those_of_no_dataset_of_the_same_seed_and_differ_between_seeds(make_plan, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.datagen import workers
+from graspq.datagen import collect
 from graspq.datasets.dataset import Dataset, open_shards
 from graspq.datasets.verify import verify
 from graspq.evaluate.runs import load_run
@@ -112,7 +112,7 @@ def killed_at(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int)
 
 
 COLLECTING = [
-    (workers, "collect_block", 1),  # before the first grasp
+    (collect, "collect_block", 1),  # before the first grasp
     (growth, "write_shard", 1),  # a round is collected but not written
     (growth, "commit_shard", 1),  # written, but not in the manifest
     (growth, "commit_shard", 2),  # the same in the next round

@@ -24,3 +24,18 @@ def test_the_light_panda_has_few_faces_and_collides_with_hand_and_fingers_alone(
     text = robot_model.panda_urdf().read_text()
     assert text.count("<collision") == 3
     assert text.count("<box") == 2
+
+
+def test_the_model_is_made_once_in_the_users_cache_and_is_the_same_when_made_again(tmp_path, monkeypatch):
+    made = robot_model.panda_urdf()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    robot_model.panda_urdf.cache_clear()
+    again = robot_model.panda_urdf()
+    assert again.is_relative_to(tmp_path) and again.parent.name == made.parent.name
+    for path in made.parent.iterdir():
+        assert (again.parent / path.name).read_bytes() == path.read_bytes()
+    before = again.stat()
+    robot_model.panda_urdf.cache_clear()
+    assert robot_model.panda_urdf().stat() == before
+    monkeypatch.undo()
+    robot_model.panda_urdf.cache_clear()

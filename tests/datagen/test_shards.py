@@ -1,6 +1,6 @@
 from graspq.common.action_space import grasping
-from graspq.datagen.plan import human_bytes, human_time, missing_shards, plan_shards
 from graspq.datagen.settings import CollectionSettings, DatagenSettings
+from graspq.datagen.shards import episodes_of, missing_shards, plan_shards
 from graspq.datasets.manifest import Manifest
 
 SETTINGS = CollectionSettings(block_size=20, blocks_per_shard=5)
@@ -16,14 +16,14 @@ def empty_manifest():
 def test_a_larger_dataset_begins_with_the_same_shards():
     small, large = plan_shards(SETTINGS, 200), plan_shards(SETTINGS, 1000)
     assert large[:2] == small
-    assert sum(shard.episodes for shard in large) == 1000
-    assert [job.block for shard in large for job in shard.jobs] == list(range(50))
+    assert episodes_of(large) == 1000
+    assert [block.number for shard in large for block in shard] == list(range(50))
 
 
 def test_a_size_that_twenty_does_not_divide_ends_in_a_short_block():
     plan = plan_shards(SETTINGS, 130)
-    assert [job.episodes for job in plan[-1].jobs] == [20, 10]
-    assert sum(shard.episodes for shard in plan) == 130
+    assert [(block.episodes, block.first_episode) for block in plan[-1]] == [(20, 100), (10, 120)]
+    assert episodes_of(plan) == 130
 
 
 def test_all_shards_of_an_empty_dataset_are_missing():
@@ -34,10 +34,3 @@ def test_folders_are_named_after_task_and_size():
     assert str(DatagenSettings(size=10_000).folder()) == "data/regular-10k"
     assert str(DatagenSettings(size=1_000_000, task="targeted").folder()) == "data/targeted-1M"
     assert str(DatagenSettings(size=2500).folder()) == "data/regular-2500"
-
-
-def test_bytes_and_times_are_written_as_people_read_them():
-    assert human_bytes(35_200_000) == "35.2 MB"
-    assert human_bytes(999) == "999 B"
-    assert human_time(72_000) == "20.0 h"
-    assert human_time(600) == "10 min"

@@ -41,7 +41,7 @@ def objects(regular_objects):
 def finished(tmp_path_factory, objects):
     folder = tmp_path_factory.mktemp("data") / "one"
     done = run(*SMALL, "--out", folder, "--objects", objects, "--workers", 1)
-    assert re.search(r"130 regular grasps to collect .* about 468.0 kB and \d+ s", done.stdout)
+    assert re.search(r"130 regular grasps to collect .* about 468.0 kB and [\d.]+ s", done.stdout)
     return folder
 
 
@@ -74,6 +74,20 @@ def test_killed_and_resumed_it_gives_the_same_bytes(finished, tmp_path, objects)
     assert digests(folder) == digests(finished)
 
 
+def test_two_collections_into_one_folder_are_not_mixed(finished, tmp_path, objects):
+    folder = tmp_path / "shared"
+    arguments = (*SMALL, "--out", folder, "--objects", objects, "--workers", 1)
+    with subprocess.Popen(command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
+        while not (folder / "manifest.json").exists():
+            assert first.poll() is None
+            time.sleep(0.05)
+        done = run(*arguments, expect=2)
+        assert done.stderr.strip() == (
+            f"error: {folder}: another grasp-datagen works here; wait for its end, or choose another folder with --out"
+        )
+    assert digests(folder) == digests(finished)
+
+
 def test_a_smaller_dataset_is_extended_to_the_same_bytes(finished, tmp_path, objects):
     folder = tmp_path / "extended"
     run("--size", "50", "--seed", "3", "--out", folder, "--objects", objects)
@@ -97,7 +111,7 @@ def test_a_finished_dataset_is_left_alone(finished, objects):
         (("--size", "many"), "expected a whole number of at least 1"),
         (("--task", "stacking"), "unknown task 'stacking'; choose from regular, targeted"),
         (("--seed", "-1"), "--seed: expected a number of at least 0, got -1"),
-        (("--workers", "0"), "--workers: expected a number of at least 1, got 0"),
+        (("--workers", "-1"), "--workers: expected a number of at least 0, got -1"),
         (("--objects", "/nowhere"), "/nowhere"),
         (("--size", "900000M"), "the disk has"),
     ],

@@ -4,7 +4,7 @@ Run again after any interruption it does what is missing; the bytes that result 
 or on how often it was interrupted. They depend on the settings and the versions in the manifest.
 """
 
-from collections.abc import Iterable
+import contextlib
 from pathlib import Path
 
 import click
@@ -12,21 +12,21 @@ import numpy as np
 from tqdm import tqdm
 
 from graspq.common.errors import UserError
-from graspq.common.files import TEMPORARY_PREFIX, writable_folder
+from graspq.common.files import LOCK_NAME, TEMPORARY_PREFIX, locked, writable_folder
 from graspq.common.machine import available_cores
 from graspq.common.provenance import versions
-from graspq.datagen.plan import (
+from graspq.common.text import bytes_text, counted, duration_text
+from graspq.datagen.collect import Collection, collected
+from graspq.datagen.settings import DatagenSettings
+from graspq.datagen.shards import (
     BYTES_PER_GRASP,
     GRASPS_PER_SECOND_AND_CORE,
-    ShardPlan,
+    Shard,
     check_disk,
-    human_bytes,
-    human_time,
+    episodes_of,
     missing_shards,
     plan_shards,
 )
-from graspq.datagen.settings import DatagenSettings
-from graspq.datagen.workers import BlockJob, collect_blocks
 from graspq.datasets.card import write_card
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
@@ -42,37 +42,42 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     """Collect what is missing of a dataset and return its manifest.
 
     Raises:
-        UserError: the folder holds something else, cannot be written to, or the disk is too small.
+        UserError: the folder holds something else, cannot be written to, or another process collects into it; the
+            disk is too small; or a block ended two workers, after all others are done.
     """
     folder, task = settings.folder(), task_named(settings.task)
     _refuse_other_folder(folder)
-    existing = Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else None
+    existing = _existing(folder)
     _check_space(settings, folder, existing)
     objects = _object_set(settings, task, folder, existing)
     fresh = describe(settings, task, objects)
+    plan = plan_shards(settings.collection(), settings.size)
     if existing is not None:
         _require_same(folder, existing, fresh)
-    plan = plan_shards(settings.collection(), settings.size)
-    missing = missing_shards(plan, existing or fresh)
-    if existing is not None and not missing and existing.files:
-        click.echo(f"{folder} is complete: {existing.episodes:,} grasps, {human_bytes(existing.bytes)}")
-        return existing
+        if not missing_shards(plan, existing) and existing.files:
+            click.echo(f"{folder} is complete: {existing.episodes:,} grasps, {bytes_text(existing.bytes)}")
+            return existing
     draw_check(task, objects, settings)
     writable_folder(folder, "dataset")
-    workers = settings.workers if settings.workers is not None else available_cores()
-    _announce(settings, folder, missing, workers)
-    remove_leftovers(folder)
-    objects.copy_to(folder / "objects")
-    manifest = existing if existing is not None else fresh
-    if existing is None:
+    with locked(folder, "grasp-datagen"):
+        manifest = _existing(folder) or fresh
+        _require_same(folder, manifest, fresh)
+        missing = missing_shards(plan, manifest)
+        _announce(settings, folder, missing)
+        remove_leftovers(folder)
+        objects.copy_to(folder / "objects")
         manifest.save(folder)
-    manifest = _collect(settings, folder, task, manifest, missing, workers)
-    manifest = write_card(folder, manifest)
+        manifest = _collect(settings, folder, task, manifest, missing)
+        manifest = write_card(folder, manifest)
     click.echo(
-        f"{folder}: {manifest.episodes:,} grasps, {manifest.rows:,} steps, {human_bytes(manifest.bytes)}, "
+        f"{folder}: {manifest.episodes:,} grasps, {manifest.rows:,} steps, {bytes_text(manifest.bytes)}, "
         f"success rate {manifest.successes / manifest.episodes:.3f}, manifest {manifest.digest()[:16]}"
     )
     return manifest
+
+
+def _existing(folder: Path) -> Manifest | None:
+    return Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else None
 
 
 def describe(settings: DatagenSettings, task: Task, objects: ObjectSet) -> Manifest:
@@ -104,7 +109,8 @@ def _refuse_other_folder(folder: Path) -> None:
     if not folder.is_dir() or (folder / MANIFEST_NAME).is_file():
         return
     names = [entry.name for entry in folder.iterdir()]
-    foreign = [name for name in names if name != "objects" and not name.startswith(TEMPORARY_PREFIX)]
+    known = ("objects", LOCK_NAME)
+    foreign = [name for name in names if name not in known and not name.startswith(TEMPORARY_PREFIX)]
     if foreign:
         raise UserError(f"{folder}: holds {foreign[0]!r} but no {MANIFEST_NAME}; choose an empty folder with --out")
 
@@ -144,40 +150,36 @@ def _check_space(settings: DatagenSettings, folder: Path, existing: Manifest | N
     check_disk(place, max(0, settings.size - (existing.episodes if existing is not None else 0)))
 
 
-def _announce(settings: DatagenSettings, folder: Path, missing: list[ShardPlan], workers: int) -> None:
-    grasps = sum(shard.episodes for shard in missing)
-    expected = grasps * BYTES_PER_GRASP
-    seconds = grasps / (GRASPS_PER_SECOND_AND_CORE * min(workers, available_cores()))
+def _announce(settings: DatagenSettings, folder: Path, missing: list[Shard]) -> None:
+    grasps = episodes_of(missing)
+    workers = settings.workers if settings.workers is not None else available_cores()
+    seconds = grasps / (GRASPS_PER_SECOND_AND_CORE * max(1, min(workers, available_cores())))
+    where = f"with {counted(workers, 'worker')}" if settings.engine == "local" else "on Ray"
     click.echo(
-        f"{grasps:,} {settings.task} grasps to collect into {folder} with {workers} worker{'s' * (workers > 1)}: "
-        f"about {human_bytes(expected)} and {human_time(seconds)} "
+        f"{grasps:,} {settings.task} grasps to collect into {folder} {where}: about "
+        f"{bytes_text(grasps * BYTES_PER_GRASP)} and {duration_text(seconds)} "
         f"(at {GRASPS_PER_SECOND_AND_CORE:g} grasps a second and core)"
     )
 
 
-def _collect(
-    settings: DatagenSettings,
-    folder: Path,
-    task: Task,
-    manifest: Manifest,
-    missing: list[ShardPlan],
-    workers: int,
-) -> Manifest:
-    shard_of = {job.block: shard for shard in missing for job in shard.jobs}
-    collected: dict[int, list[Episode]] = {}
-    jobs: Iterable[BlockJob] = (job for shard in missing for job in shard.jobs)
-    total = sum(shard.episodes for shard in missing)
+def _collect(settings: DatagenSettings, folder: Path, task: Task, manifest: Manifest, missing: list[Shard]) -> Manifest:
+    collection = Collection(task.settings.to_json(), folder / "objects", settings.collection())
+    shard_of = {block: shard for shard in missing for block in shard}
+    waiting: dict[int, list[Episode]] = {}
     done = successes = 0
-    with tqdm(total=total, unit="grasp", smoothing=0.05, dynamic_ncols=True) as bar:
-        for job, episodes in collect_blocks(jobs, task, folder / "objects", settings.collection(), workers):
-            collected[job.block] = episodes
+    with (
+        tqdm(total=episodes_of(missing), unit="grasp", smoothing=0.05, dynamic_ncols=True) as bar,
+        contextlib.closing(collected(collection, shard_of, settings)) as finished,
+    ):
+        for block, episodes in finished:
+            waiting[block.number] = episodes
             done += len(episodes)
             successes += sum(episode.success for episode in episodes)
             bar.update(len(episodes))
             bar.set_postfix(success=f"{successes / done:.3f}", refresh=False)
-            shard = shard_of[job.block]
-            if all(other.block in collected for other in shard.jobs):
-                ordered = [episode for other in shard.jobs for episode in collected.pop(other.block)]
-                entry = write_shard(folder, manifest, shard.first_block, len(shard.jobs), ordered)
+            numbers = [other.number for other in shard_of[block]]
+            if all(number in waiting for number in numbers):
+                ordered = [episode for number in numbers for episode in waiting.pop(number)]
+                entry = write_shard(folder, manifest, numbers[0], len(numbers), ordered)
                 manifest = commit_shard(folder, manifest, entry)
     return manifest
