@@ -29,6 +29,7 @@ class VerifySettings(Settings):
     """Settings of `grasp-data verify`."""
 
     path: Path = setting(help="dataset folder", positional=True, metavar="PATH")
+    workers: int | None = setting(None, help="Processes; all cores if not given, 0 for this one.", minimum=0)
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def verify(settings: VerifySettings) -> int:
 
     total = Dataset.open(settings.path).manifest.bytes
     with tqdm(total=total, unit="B", unit_scale=True, desc="verify", disable=None) as bar:
-        report = verify_dataset(settings.path, bar.update)
+        report = verify_dataset(settings.path, bar.update, settings.workers)
     for line in report.notes:
         click.echo(f"note: {line}")
     for line in report.faults:

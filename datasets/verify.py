@@ -3,7 +3,8 @@
 A single flipped bit in any file of the dataset is found, whichever file it is in.
 """
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
-from graspq.common.files import read_json, sha256_of
+from graspq.common.files import LOCK_NAME, read_json, sha256_of
 from graspq.datasets.blocks import BlockRef, read_block
 from graspq.datasets.columns import sizes_of, wrong_labels
 from graspq.datasets.dataset import Dataset, check_file
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
 from graspq.datasets.tables import episodes_schema, steps_schema
+from graspq.engine import EngineSettings, Place, run
 
 OBJECT_SET = "objects/object_set.json"
 Progress = Callable[[int], Any]
@@ -40,24 +42,45 @@ class Report:
     bytes: int
 
 
-def verify(folder: Path | str, progress: Progress = lambda _: None) -> Report:
+@dataclass(frozen=True)
+class Checking:
+    """How shards are checked; the `Work` of a verification."""
+
+    folder: Path
+
+    def folders(self) -> Sequence[Path]:
+        """Return nothing: shards are read where they lie."""
+        return ()
+
+    @contextlib.contextmanager
+    def open(self, place: Place) -> Iterator[Callable[[ShardEntry], list[str]]]:
+        """Open the dataset."""
+        dataset = Dataset.open(self.folder)
+        yield lambda entry: list(_shard(dataset, entry))
+
+
+def verify(folder: Path | str, progress: Progress = lambda _: None, workers: int | None = 0) -> Report:
     """Check a whole dataset.
 
     Args:
         folder: the dataset.
         progress: called with the bytes of each shard that has been checked; `Manifest.bytes` in all.
+        workers: processes of this machine; 0 for this process itself, None for all cores.
 
     Raises:
         UserError: the folder is no dataset, or its manifest is damaged.
     """
     folder = Path(folder)
-    dataset = Dataset.open(folder)
-    manifest = dataset.manifest
+    manifest = Dataset.open(folder).manifest
     faults = [*_named_files(folder, manifest), *_object_files(folder, manifest)]
+    engine = EngineSettings(workers=workers if len(manifest.shards) > 1 else 0)
+    by_shard: dict[str, list[str]] = {}
+    with contextlib.closing(run(Checking(folder), manifest.shards, engine, name=lambda entry: entry.name)) as checked:
+        for entry, found in checked:
+            by_shard[entry.name] = found
+            progress(entry.bytes)
+    faults += [fault for entry in manifest.shards for fault in by_shard[entry.name]]
     following = 0
-    for entry in manifest.shards:
-        faults += _shard(dataset, entry)
-        progress(entry.bytes)
     belonging = _belonging(folder, manifest)
     present = [path for path in belonging if (folder / path).is_file()]
     notes = [f"{folder / path}: not part of the dataset, no manifest lists it" for path in _others(folder, belonging)]
@@ -105,7 +128,7 @@ def _belonging(folder: Path, manifest: Manifest) -> set[str]:
 
 
 def _others(folder: Path, belonging: set[str]) -> list[str]:
-    files = (path for path in folder.rglob("*") if path.is_file())
+    files = (path for path in folder.rglob("*") if path.is_file() and path != folder / LOCK_NAME)
     return sorted(name for path in files if (name := path.relative_to(folder).as_posix()) not in belonging)
 
 

@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "engine": {"common"},
     "objects": {"common"},
     "sim": {"objects", "common"},
-    "datasets": {"common"},
+    "datasets": {"engine", "common"},
     "train": {"datasets", "common"},
     "policies": {"sim", "train", "objects", "common"},
     "datagen": {"engine", "policies", "sim", "objects", "datasets", "common"},

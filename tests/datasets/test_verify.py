@@ -114,3 +114,12 @@ def test_counts_that_are_not_those_of_the_files_are_a_fault(new_dataset):
     wrong = dataclasses.replace(manifest.shards[1], successes=manifest.shards[1].successes + 1)
     manifest.with_shard(wrong).save(folder)
     assert len(verify(folder).faults) == 1
+
+
+def test_workers_find_what_this_process_finds_in_the_order_of_the_shards(new_dataset):
+    folder = new_dataset()
+    for path in sorted((folder / "shards").iterdir()):
+        path.write_bytes(path.read_bytes()[:-1] + b"?")
+    seen = []
+    assert verify(folder, seen.append, workers=2) == verify(folder) and len(verify(folder).faults) == 3
+    assert sum(seen) == Manifest.load(folder).bytes
