@@ -91,10 +91,10 @@ class _Source(Generic[B]):
         self._sampler, self._gather = sampler, gather
         self.buffer = _Buffer(pool)
 
-    def batches(self, start_step: int) -> Iterator[B]:
-        """Yield the batch of each global step from `start_step` on, without end."""
+    def batches(self, start_step: int, every: int) -> Iterator[B]:
+        """Yield the batch of every `every`-th global step from `start_step` on, without end."""
         resident: tuple[int, range] | None = None
-        for global_step in itertools.count(start_step):
+        for global_step in itertools.count(start_step, every):
             epoch, step = self._sampler.position(global_step)
             touched = self._sampler.windows_of(epoch, step)
             following = self._following(epoch, touched.stop)
@@ -135,11 +135,13 @@ class _Loader(Generic[B]):
     The thread knows the source and the queue alone: a loader that is dropped without `close` ends its thread.
     """
 
-    def __init__(self, pool: ShardPool, sampler: Sampler, gather: Gather[B], start_step: int, prefetch: int) -> None:
+    def __init__(
+        self, pool: ShardPool, sampler: Sampler, gather: Gather[B], start_step: int, every: int, prefetch: int
+    ) -> None:
         self.pool, self.sampler = pool, sampler
-        self.step = start_step
+        self.step, self._every = start_step, every
         self._source = _Source(pool, sampler, gather)
-        self._batches = self._source.batches(start_step)
+        self._batches = self._source.batches(start_step, every)
         self._queue: queue.Queue[B | BaseException] = queue.Queue(prefetch)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -174,7 +176,7 @@ class _Loader(Generic[B]):
                 self.close()
                 raise received
             batch = received
-        self.step += 1
+        self.step += self._every
         return batch
 
     def close(self) -> None:
@@ -237,6 +239,7 @@ class TransitionLoader(_Loader[TransitionBatch]):
         rank: this process, 0 .. ranks − 1.
         ranks: number of processes.
         prefetch: batches assembled ahead by the background thread; 0 works without a thread.
+        every: global steps from one batch to the next: n processes that share the work take every n-th.
         need_next: also gather s′; where no target reads it, leaving it out halves the copying.
 
     Raises:
@@ -253,11 +256,12 @@ class TransitionLoader(_Loader[TransitionBatch]):
         rank: int = 0,
         ranks: int = 1,
         prefetch: int = 2,
+        every: int = 1,
         need_next: bool = True,
     ) -> None:
         rows = buffer_bytes // pool.row_bytes
         sampler = Sampler([ref.rows for ref in pool.blocks], batch_size, seed, rows, rank, ranks)
-        super().__init__(pool, sampler, partial(gather_transitions, need_next=need_next), start_step, prefetch)
+        super().__init__(pool, sampler, partial(gather_transitions, need_next=need_next), start_step, every, prefetch)
 
 
 class EpisodeLoader(_Loader[EpisodeBatch]):
@@ -276,6 +280,7 @@ class EpisodeLoader(_Loader[EpisodeBatch]):
         rank: int = 0,
         ranks: int = 1,
         prefetch: int = 2,
+        every: int = 1,
         max_steps: int | None = None,
     ) -> None:
         longest = pool.max_steps if max_steps is None else max_steps
@@ -284,7 +289,7 @@ class EpisodeLoader(_Loader[EpisodeBatch]):
         sampler = Sampler(
             [ref.rows for ref in pool.blocks], batch_size, seed, rows, rank, ranks, items_per_block=episodes
         )
-        super().__init__(pool, sampler, partial(gather_episodes, max_steps=longest), start_step, prefetch)
+        super().__init__(pool, sampler, partial(gather_episodes, max_steps=longest), start_step, every, prefetch)
 
 
 def transition_batches(pool: ShardPool, batch_size: int, need_next: bool = True) -> Iterator[TransitionBatch]:
