@@ -3,14 +3,14 @@
 Dimension key: B states, N candidates, A action.
 """
 
+import copy
 from collections.abc import Callable
 
 from torch import Tensor
 
-from graspq.train.networks.network import QNetwork
+from graspq.evaluate.q_policy import QPolicy
+from graspq.train.networks import QNetwork
 from graspq.train.selection import QOfActions
-
-Way = Callable[[QNetwork, Tensor, Tensor], QOfActions]
 
 
 def tiled(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
@@ -35,5 +35,26 @@ def once(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
     return network.at(image, step)
 
 
-TILED, ANEW, ONCE = "64 tiled copies", "trunk each iteration", "trunk once"
-WAYS: dict[str, Way] = {TILED: tiled, ANEW: anew, ONCE: once}
+WAYS: dict[str, Callable[[QNetwork, Tensor, Tensor], QOfActions]] = {
+    "64 tiled copies": tiled,
+    "trunk each iteration": anew,
+    "trunk once": once,
+}
+
+
+class _Asked:
+    """A Q-network to a policy, which asks for values in another way."""
+
+    def __init__(self, network: QNetwork, way: str) -> None:
+        self._network, self._way = network, WAYS[way]
+
+    def at(self, image: Tensor, step: Tensor) -> QOfActions:
+        """Return Q of candidate actions in these states; see `QNetwork.at`."""
+        return self._way(self._network, image, step)
+
+
+def asking(policy: QPolicy, way: str) -> QPolicy:
+    """Return a copy of a policy that searches the same, and asks for values in one of `WAYS`."""
+    rival = copy.copy(policy)
+    rival.network = _Asked(policy.network, way)  # type: ignore[assignment]
+    return rival

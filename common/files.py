@@ -215,8 +215,7 @@ def read_json(path: Path, what: str) -> Any:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path}: no {what} here") from None
-    # Text that is no UTF-8 and numbers of thousands of digits are ValueErrors too.
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise UserError(f"{path}: not a readable {what} ({error})") from None
 
 

@@ -1,18 +1,21 @@
-"""Objects that a user names as `module:name`: their own policies, tasks and estimators.
+"""Objects that a user names as `module:name`: their own policies, tasks, estimators and networks.
 
-The module may lie in the working folder.
+The module may lie in the working folder. Naming one runs its code.
 """
 
 import importlib
 import os
 import sys
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
+
+Row = TypeVar("Row")
 
 
 def named_module(name: str) -> ModuleType:
@@ -46,6 +49,29 @@ def named_object(name: str, what: str) -> Any:
     if not hasattr(module, attribute):
         raise UserError(f"{what} {name}: {module_name} has no {attribute!r}")
     return getattr(module, attribute)
+
+
+def named_row(option: str, name: str, table: Mapping[str, Row], kind: type[Row], noun: str) -> Row:
+    """Return a row of a table by its name, or a user's own as `module:name`.
+
+    Args:
+        option: that names it, for the messages.
+        name: a key of the table or `module:name`.
+        table: ours.
+        kind: what a row is.
+        noun: what a row is called.
+
+    Raises:
+        UserError: there is none of that name, or what is there is no such row.
+    """
+    if name in table:
+        return table[name]
+    if ":" not in name:
+        raise UserError(f"{option}: {name!r} is unknown; choose from {', '.join(table)}, or module:{noun} of your own")
+    row = named_object(name, option)
+    if not isinstance(row, kind):
+        raise UserError(f"{option} {name}: expected {kind.__name__}, got {type(row).__name__}")
+    return row
 
 
 def source_digest(name: str) -> str | None:

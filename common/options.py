@@ -10,7 +10,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,6 +32,8 @@ def setting(
     positional: bool = False,
     parse: Callable[[str], Any] | None = None,
     metavar: str | None = None,
+    source: str | None = None,
+    none: str | None = None,
 ) -> Any:
     """Return a dataclass field that is also a command-line option.
 
@@ -43,14 +45,17 @@ def setting(
         positional: make it an argument (`RUN...`) rather than an option.
         parse: turns the text of the command line into the value; raises `ValueError` saying what was expected.
         metavar: placeholder in the help text.
+        source: where the value comes from, such as a section of the paper; the help ends with it.
+        none: the word that stands for None on the command line, where None is a value like any other.
     """
     metadata = {
-        "help": help,
+        "help": f"{help} Source: {source}." if source is not None else help,
         "minimum": minimum,
         "maximum": maximum,
         "positional": positional,
         "parse": parse,
         "metavar": metavar,
+        "none": none,
     }
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -160,6 +165,26 @@ class _Parsed(click.ParamType):  # type: ignore[type-arg]
             self.fail(f"{value!r}: {error}", param, ctx)
 
 
+class _OrNone(click.ParamType):  # type: ignore[type-arg]
+    """A click type with a word that stands for None."""
+
+    def __init__(self, kind: Any, word: str) -> None:
+        self.kind, self.word = kind, word
+        self.name = f"{kind.name}|{word}"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        return None if value == self.word else self.kind.convert(value, param, ctx)
+
+
+def shown_value(field: "dataclasses.Field[Any]", value: Any) -> str:
+    """Return a setting's value as the command line takes it, for help texts."""
+    if value is None:
+        return field.metadata.get("none") or "none"
+    if isinstance(value, bool):
+        return flag(field.name) if value else f"--no-{flag(field.name)[2:]}"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def options_from(settings_type: type[Settings]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator that gives a click command the options of `settings_type`.
 
@@ -171,40 +196,60 @@ def options_from(settings_type: type[Settings]) -> Callable[[Callable[..., Any]]
         def command(**values: Any) -> Any:
             return function(settings_type(**values))
 
-        hints = typing.get_type_hints(settings_type)
-        for field in reversed(dataclasses.fields(settings_type)):
-            if field.metadata.get("help") is not None:
-                command = _parameter(field, hints[field.name])(command)
+        command.__click_params__ = list(reversed(parameters(settings_type)))  # type: ignore[attr-defined]
         return command
 
     return decorate
+
+
+def parameters(settings_type: type[Settings], defaults: Mapping[str, str] | None = None) -> list[click.Parameter]:
+    """Return the options of `settings_type`, in its order; a field without help is none.
+
+    Args:
+        settings_type: the settings.
+        defaults: what the help says of the defaults of some fields, by name. These options have no default for click:
+            whoever reads them must ask `given_options` which were given.
+    """
+    hints = typing.get_type_hints(settings_type)
+    shown = defaults or {}
+    return [
+        _parameter(field, hints[field.name], shown.get(field.name))
+        for field in dataclasses.fields(settings_type)
+        if field.metadata.get("help") is not None
+    ]
+
+
+def given_options(context: click.Context) -> dict[str, Any]:
+    """Return the options that the command line gave, by the names of their fields: "not given" is no value."""
+    spoken = click.core.ParameterSource.COMMANDLINE
+    return {name: value for name, value in context.params.items() if context.get_parameter_source(name) is spoken}
 
 
 def _is_literal(hint: Any) -> bool:
     return typing.get_origin(hint) is typing.Literal
 
 
-def _parameter(field: Any, hint: Any) -> Callable[..., Any]:
+def _parameter(field: Any, hint: Any, shown: str | None) -> click.Parameter:
     several = typing.get_origin(hint) is tuple
     inner = typing.get_args(hint)[0] if several else _without_none(hint)
-    parse = field.metadata["parse"]
+    parse, metavar = field.metadata["parse"], field.metadata["metavar"]
     required = field.default is dataclasses.MISSING
     kind = _Parsed(parse, field.name) if parse is not None else _click_type(inner)
+    if field.metadata["none"] is not None:
+        kind = _OrNone(kind, field.metadata["none"])
     if field.metadata["positional"]:
-        return click.argument(
-            field.name, type=kind, nargs=-1 if several else 1, required=required, metavar=field.metadata["metavar"]
-        )
-    arguments: dict[str, Any] = {"help": field.metadata["help"], "required": required, "multiple": several}
-    if not required and field.default is not None and field.default != ():
-        arguments |= {"default": field.default, "show_default": True}
-    elif several:
+        return click.Argument([field.name], type=kind, nargs=-1 if several else 1, required=required, metavar=metavar)
+    text = field.metadata["help"] if shown is None else f"{field.metadata['help']} [{shown}]"
+    arguments: dict[str, Any] = {"help": text, "required": required and shown is None, "multiple": several}
+    if several:
         arguments["default"] = ()
+    if shown is None and not required and field.default is not None and field.default != ():
+        arguments |= {"default": field.default, "show_default": True}
     if inner is bool:
         # Said outright: click makes of a switch without a default, and not given, False.
         arguments.setdefault("default", None)
-        return click.option(f"{flag(field.name)}/--no-{flag(field.name)[2:]}", field.name, **arguments)
-    metavar = field.metadata["metavar"]
-    return click.option(flag(field.name), field.name, type=kind, metavar=metavar, **arguments)
+        return click.Option([f"{flag(field.name)}/--no-{flag(field.name)[2:]}", field.name], **arguments)
+    return click.Option([flag(field.name), field.name], type=kind, metavar=metavar, **arguments)
 
 
 def _without_none(hint: Any) -> Any:

@@ -37,9 +37,6 @@ class LocalWorker:
         with _interrupts_blocked():
             self._executor.submit(int)  # the executor starts its process with the first thing to do
         self._processes = set(multiprocessing.active_children()) - before
-        # Only the process itself holds the writing end: killed in the midst of a result it ends the pipe, and the
-        # executor's thread that reads there does not wait for the rest for ever.
-        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
 
     def submit(self, unit: Any) -> "Future[Outcome[Any]]":
         """Give it a unit."""

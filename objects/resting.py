@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.spatial
 
-from graspq.objects.geometry import Array, horizontal_axes
+from graspq.objects.geometry import Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +98,9 @@ def narrowest_width(points: Array, up: Array) -> float:
 
     The least width of a convex polygon is attained perpendicular to one of its edges (rotating calipers).
     """
-    flat = points @ horizontal_axes(up)
+    helper = np.eye(3)[int(np.abs(up).argmin())]
+    first = np.cross(up, helper)
+    first /= np.linalg.norm(first)
+    flat = points @ np.stack([first, np.cross(up, first)], axis=1)
     outline = scipy.spatial.ConvexHull(flat)
     return float(np.ptp(flat[outline.vertices] @ outline.equations[:, :2].T, axis=0).min())

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from typing import Literal
+from typing import Any
 
 import torch
 
@@ -15,20 +15,19 @@ from graspq.datasets.batch import EpisodeBatch, TransitionBatch
 from graspq.datasets.loader import EpisodeLoader, TransitionLoader, episode_batches, transition_batches
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch, episodes_of_a_batch, to_tensors
-from graspq.train.distributed import ALONE, Ranks
-from graspq.train.estimators import Estimator
-from graspq.train.resident import ResidentPool, image_bytes
+from graspq.train.estimator import TargetValue
+from graspq.train.parallel import ALONE, Ranks
+from graspq.train.resident import ResidentPool
 from graspq.train.settings import TrainSettings
 
-# Of a GPU's free memory; the rest is for networks, optimisers and activations.
-RESIDENT_SHARE = 0.6
+VALIDATION_ROWS = 8192
 
 
 @contextlib.contextmanager
 def training_batches(
     pool: ShardPool,
     settings: TrainSettings,
-    estimator: Estimator,
+    wanted: TargetValue[Any],
     device: torch.device,
     start_step: int,
     ranks: Ranks = ALONE,
@@ -38,7 +37,7 @@ def training_batches(
     Args:
         pool: what to train on.
         settings: of the run.
-        estimator: says whether a batch holds transitions or episodes, and whether it needs s'.
+        wanted: says whether a batch holds transitions or episodes, and whether it needs s'.
         device: where the batches lie.
         start_step: of the first batch.
         ranks: those that share each batch.
@@ -46,59 +45,49 @@ def training_batches(
     Raises:
         UserError: a batch is larger than the data, the buffer too small, or a shard is damaged.
     """
-    resident = is_resident(settings.resident, device, image_bytes(pool))
+    resident = settings.resident
     # Of a pool on the device the loader gives the order alone, and reads nothing.
-    with _loader(pool, settings, estimator, start_step, ranks, prefetch=0 if resident else 2) as loader:
+    with _loader(pool, settings, wanted, start_step, ranks, prefetch=0 if resident else 2) as loader:
         if not resident:
             yield (to_tensors(batch, device) for batch in loader)
             return
         held, sampler = ResidentPool.read(pool, device), loader.sampler
         indices = (sampler.indices(*sampler.position(step)) for step in itertools.count(start_step))
-        if estimator.view == "episodes":
+        if wanted.view == "episodes":
             yield (held.episodes(index) for index in indices)
         else:
-            yield (held.transitions(index, estimator.needs_next) for index in indices)
+            yield (held.transitions(index, wanted.needs_next) for index in indices)
 
 
 def _loader(
-    pool: ShardPool, settings: TrainSettings, estimator: Estimator, start_step: int, ranks: Ranks, prefetch: int
+    pool: ShardPool, settings: TrainSettings, wanted: TargetValue[Any], start_step: int, ranks: Ranks, prefetch: int
 ) -> TransitionLoader | EpisodeLoader:
-    rows, seed, memory = batch_rows(pool, settings, estimator), settings.seed, settings.buffer_bytes
-    if estimator.view == "episodes":
+    rows, seed, memory = batch_rows(pool, settings, wanted), settings.seed, settings.buffer_bytes
+    if wanted.view == "episodes":
         return EpisodeLoader(pool, rows, seed, memory, start_step, ranks.rank, ranks.count, prefetch)
     return TransitionLoader(
-        pool, rows, seed, memory, start_step, ranks.rank, ranks.count, prefetch, need_next=estimator.needs_next
+        pool, rows, seed, memory, start_step, ranks.rank, ranks.count, prefetch, need_next=wanted.needs_next
     )
 
 
-def batch_rows(pool: ShardPool, settings: TrainSettings, estimator: Estimator) -> int:
+def batch_rows(pool: ShardPool, settings: TrainSettings, wanted: TargetValue[Any]) -> int:
     """Return the rows of a batch over all ranks: `batch_size` transitions, or about so many in whole episodes."""
-    if estimator.view == "transitions":
+    if wanted.view == "transitions":
         return settings.batch_size
     return episodes_of_a_batch(pool, settings.batch_size)
 
 
-def is_resident(asked: Literal["auto", "yes", "no"], device: torch.device, needed: int) -> bool:
-    """Return whether so many bytes of images shall lie on the device; `auto`: on a GPU where they fit with ease."""
-    if asked != "auto":
-        return asked == "yes"
-    if device.type != "cuda":
-        return False
-    free, _ = torch.cuda.mem_get_info(device)
-    return needed <= RESIDENT_SHARE * free
-
-
 def held_back_batches(
-    held_back: ShardPool, settings: TrainSettings, estimator: Estimator, device: torch.device
+    held_back: ShardPool, settings: TrainSettings, wanted: TargetValue[Any], device: torch.device
 ) -> Iterator[Batch]:
-    """Yield the batches of a validation: the first blocks that have at most `validation_transitions` rows."""
+    """Yield the batches of a validation: the first blocks that have at most `VALIDATION_ROWS` rows."""
     rows = itertools.accumulate(ref.rows for ref in held_back.blocks)
-    kept = sum(1 for total in rows if total <= settings.validation_transitions)
+    kept = sum(1 for total in rows if total <= VALIDATION_ROWS)
     pool = dataclasses.replace(held_back, blocks=held_back.blocks[: max(kept, 1)])
-    size = batch_rows(pool, settings, estimator)
+    size = batch_rows(pool, settings, wanted)
     batches: Iterator[EpisodeBatch | TransitionBatch]
-    if estimator.view == "episodes":
+    if wanted.view == "episodes":
         batches = episode_batches(pool, size)
     else:
-        batches = transition_batches(pool, size, estimator.needs_next)
+        batches = transition_batches(pool, size, wanted.needs_next)
     yield from (to_tensors(batch, device) for batch in batches)

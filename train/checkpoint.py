@@ -6,8 +6,6 @@ A checkpoint is a folder `step-00000500` with one file for each network and opti
 import dataclasses
 import hashlib
 import json
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,75 +15,71 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from graspq.common.errors import UserError
-from graspq.common.files import TEMPORARY_PREFIX, fsync_folder, read_json
-from graspq.train.networks import NetworkSpecification
+from graspq.common.files import committed_folder, read_json
+from graspq.train.estimators import estimator_named
+from graspq.train.networks import build
+from graspq.train.networks.network import NetworkSpecification
 from graspq.train.run import Run, checkpoint_name, step_of
-from graspq.train.state import Networks, TrainState, make_part
+from graspq.train.state import TrainState
 
-FORMAT = 2
+FORMAT = 3
+KEPT = "kept"
 STATE_FILE = "state.json"
 REMEDY = "copy it again, or delete this checkpoint's folder to go on from the one before it"
 
 
-def save_checkpoint(folder: Path, state: TrainState, specification: NetworkSpecification) -> Path:
+def save_checkpoint(folder: Path, state: TrainState) -> Path:
     """Write `folder/step-NNNNNNNN` durably and return it; after a crash it is there whole or not at all.
 
     Args:
         folder: the run's `checkpoints`.
         state: all of it is kept.
-        specification: how to build the networks again.
     """
     final = folder / checkpoint_name(state.step)
-    temporary = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-{final.name}"
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    contents = {f"{name}.safetensors": network.state_dict() for name, network in state.networks.items()}
+    networks = state.networks
+    contents = {f"{name}.safetensors": network.state_dict() for name, network in state.named_networks.items()}
     contents |= {
-        f"optimizer-{part}.safetensors": _moments(optimizer, state.learned[part])
+        f"optimizer-{part}.safetensors": _moments(optimizer, networks.online[part])
         for part, optimizer in state.optimizers.items()
     }
-    contents["extra.safetensors"] = state.extra
-    files = {name: _write(temporary / name, _packed(tensors)) for name, tensors in contents.items()}
-    description = {
-        "format": FORMAT,
-        "step": state.step,
-        "network": specification.to_json(),
-        "parts": dict(state.parts),
-        "files": files,
-    }
-    described = json.dumps(description | {"digest": _digest(description)}, indent=2) + "\n"
-    _write(temporary / STATE_FILE, described.encode())
-    fsync_folder(temporary)
-    if final.exists():
-        shutil.rmtree(final)
-    temporary.replace(final)
-    fsync_folder(folder)
+    contents[f"{KEPT}.safetensors"] = networks.kept
+    with committed_folder(final, replace=True) as temporary:
+        files = {name: _write(temporary / name, _packed(tensors)) for name, tensors in contents.items()}
+        description = {
+            "format": FORMAT,
+            "step": state.step,
+            "network": networks.specification.to_json(),
+            "parts": list(networks.online),
+            "files": files,
+        }
+        described = json.dumps(description | {"digest": _digest(description)}, indent=2) + "\n"
+        _write(temporary / STATE_FILE, described.encode())
     return final
 
 
-def load_checkpoint(checkpoint: Path, state: TrainState, specification: NetworkSpecification) -> None:
+def load_checkpoint(checkpoint: Path, state: TrainState) -> None:
     """Fill a freshly made state with a checkpoint's: training goes on as if it had never stopped.
 
     Raises:
         UserError: the checkpoint is damaged, or of another network.
     """
-    description = describe(checkpoint)
-    if description["network"] != specification.to_json():
+    description, networks = describe(checkpoint), state.networks
+    if description["network"] != networks.specification.to_json():
         raise UserError(
-            f"{checkpoint}: of another network: expected {specification.to_json()}, got {description['network']}; "
-            "choose another run folder with --out"
+            f"{checkpoint}: of another network: expected {networks.specification.to_json()}, "
+            f"got {description['network']}; choose another run folder with --out"
         )
     optimizers = [f"optimizer-{part}" for part in state.optimizers]
-    expected = {f"{name}.safetensors" for name in [*state.networks, *optimizers, "extra"]}
+    expected = {f"{name}.safetensors" for name in [*state.named_networks, *optimizers, KEPT]}
     if set(description["files"]) != expected:
         raise UserError(f"{checkpoint}: expected {', '.join(sorted(expected))}; choose another run folder with --out")
-    for name, network in state.networks.items():
+    for name, network in state.named_networks.items():
         _fill(checkpoint / f"{name}.safetensors", network, read_tensors(checkpoint, description, name))
     for part, optimizer in state.optimizers.items():
         moments = read_tensors(checkpoint, description, f"optimizer-{part}")
-        _restore_moments(optimizer, state.learned[part], moments)
-    for name, tensor in read_tensors(checkpoint, description, "extra").items():
-        state.extra[name] = tensor.to(state.device)
+        _restore_moments(optimizer, networks.online[part], moments)
+    for name, tensor in read_tensors(checkpoint, description, KEPT).items():
+        networks.kept[name] = tensor.to(networks.precision.device)
     state.step = int(description["step"])
 
 
@@ -96,16 +90,16 @@ class LoadedRun:
     Attributes:
         networks: by part, the averaged networks where the run kept them, else the trained ones; in evaluation mode, on
             the CPU.
-        extra: what the estimator kept besides.
+        kept: what the estimator kept besides.
         specification: of the networks.
         config: the run's `config.json`.
         step: training step of the checkpoint.
         checkpoint: its folder.
-        sha256: of all weights and of `extra`, as one digest.
+        sha256: of all weights and of `kept`, as one digest.
     """
 
-    networks: Networks
-    extra: dict[str, Tensor]
+    networks: dict[str, nn.Module]
+    kept: dict[str, Tensor]
     specification: NetworkSpecification
     config: dict[str, Any]
     step: int
@@ -134,18 +128,21 @@ def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
             f"{checkpoint}: of another network than its run: config.json says {run.config.get('network')}, "
             f"the checkpoint {description['network']}; copy the run again"
         )
-    networks: Networks = {}
+    makers = estimator_named(run.config["settings"]["algo"]).parts
+    networks: dict[str, nn.Module] = {}
     names = []
-    for part, outputs in description["parts"].items():
+    for part in description["parts"]:
+        if part not in makers:
+            raise UserError(f"{checkpoint}: has a network {part!r}, which its estimator does not; train again")
         averaged = f"averaged-{part}.safetensors" in description["files"]
         names.append(f"averaged-{part}" if averaged else part)
-        network = make_part(part, specification, outputs)
+        network = build(makers[part], specification)
         _fill(checkpoint / f"{names[-1]}.safetensors", network, read_tensors(checkpoint, description, names[-1]))
         networks[part] = network.eval().requires_grad_(False)
-    digests = {name: description["files"][f"{name}.safetensors"] for name in [*names, "extra"]}
+    digests = {name: description["files"][f"{name}.safetensors"] for name in [*names, KEPT]}
     return LoadedRun(
         networks=networks,
-        extra=read_tensors(checkpoint, description, "extra"),
+        kept=read_tensors(checkpoint, description, KEPT),
         specification=specification,
         config=run.config,
         step=int(description["step"]),
@@ -189,22 +186,13 @@ def read_tensors(checkpoint: Path, description: dict[str, Any], name: str) -> di
         raise UserError(f"{path}: no safetensors file ({error}); {REMEDY}") from None
 
 
-def remove_unfinished(folder: Path) -> None:
-    """Remove what killed writers of checkpoints left; the caller holds the run's lock."""
-    for leftover in folder.glob(f"{TEMPORARY_PREFIX}*"):
-        shutil.rmtree(leftover, ignore_errors=True)
-
-
 def _packed(tensors: dict[str, Tensor]) -> bytes:
     # Contiguous: safetensors knows no memory format; the layout is the network's, and is restored on loading.
     return safetensors.torch.save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
 
 
 def _write(path: Path, content: bytes) -> str:
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    path.write_bytes(content)
     return hashlib.sha256(content).hexdigest()
 
 

@@ -1,33 +1,108 @@
 """`grasp-train`: trains one estimator purely off-policy from shards.
 
-Every option comes from `TrainSettings`; the loop is `train/loop.py`.
+The way on: `settings` -> `loop` -> `estimators/<row>` -> `targets` and `selection`.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import click
 
-from graspq.common.options import Command, Settings, options_from, with_version
-from graspq.train.distributed import joined
+from graspq.common.options import Command, given_options, with_version
+from graspq.train.estimators import ESTIMATORS, estimator_named
 from graspq.train.loop import train
+from graspq.train.parallel import joined
+from graspq.train.recipe import PAPER, Recipe
 from graspq.train.run import Run
-from graspq.train.settings import TrainOptions, resolve
+from graspq.train.settings import (
+    common_parameters,
+    complete,
+    network_parameters,
+    own_parameters,
+    unknown_option,
+)
+
+PRESET = click.Option(
+    ["--preset"],
+    type=click.Choice(["default", "paper"]),
+    default="default",
+    show_default=True,
+    help="What decides the options that are not given: our defaults, or the paper's text and its released code.",
+)
 
 
-@click.command(cls=Command)
+class TrainingCommand(Command):
+    """A command that takes the common options of training, and then those of the `--algo` and `--network` it is given.
+
+    Its own parameters come first.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse; the options depend on the values of `--algo`, `--preset` and `--network`."""
+        ctx.meta["words"] = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            algo, network = _chosen(args)
+            if algo is None:
+                raise
+            raise click.UsageError(unknown_option(error.option_name, algo, network), ctx) from None
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return all parameters, in the groups of the help."""
+        return [parameter for _, group in self.groups(ctx) for parameter in group]
+
+    def groups(self, ctx: click.Context) -> list[tuple[str, list[click.Parameter]]]:
+        """Return the parameters in groups: name of the group, its parameters."""
+        algo, network = _chosen(ctx.meta.get("words", []))
+        row = estimator_named(algo) if algo is not None else None
+        common = [*self.params, *common_parameters(row), PRESET, self.get_help_option(ctx)]
+        found = [("Options", [one for one in common if one is not None])]
+        if row is not None:
+            found += [(f"Options of --algo {algo}", own_parameters(row))]
+            found += [(f"Options of --network {network}", network_parameters(network))]
+        return found
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the groups of options, one after the other."""
+        for name, group in self.groups(ctx):
+            records = [record for one in group if (record := one.get_help_record(ctx)) is not None]
+            if records:
+                with formatter.section(name):
+                    formatter.write_dl(records)
+        if _chosen(ctx.meta.get("words", []))[0] is None:
+            with formatter.section("Estimators, each with options of its own: --algo NAME --help"):
+                formatter.write_dl([(name, f"{row.summary}.") for name, row in ESTIMATORS.items()])
+
+
+def _chosen(words: Sequence[str]) -> tuple[str | None, str]:
+    """Return the values of `--algo` and `--network` in a command line, as they decide which options there are."""
+    found = {"--preset": "default"}
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if name in ("--algo", "--network", "--preset"):
+            found[name] = value if equals else following
+    algo = found.get("--algo")
+    recipe = Recipe()
+    if found["--preset"] == "paper":
+        recipe = estimator_named(algo).paper_recipe if algo is not None else PAPER
+    return algo, found.get("--network", recipe.network)
+
+
+@click.command(cls=TrainingCommand)
 @with_version
-@options_from(TrainOptions)
-def main(options: Settings) -> None:
+@click.pass_context
+def main(context: click.Context, /, **_: Any) -> None:
     """Train a Q-function from shards: `grasp-train --algo mc --shards data/regular-10k`.
 
     The same command goes on where an earlier one was stopped or killed.
 
     Several processes train one network with `torchrun --no-python --nproc-per-node 2 grasp-train ...`, each on its part
-    of every batch: --batch-size is that of all together, and they learn what one learns, up to rounding. With GPUs each
-    takes one of its own. The first alone writes the run folder, which all must see; an error of one ends all.
+    of every batch: --batch-size is that of all together. The first alone writes the run folder, which all must see.
     """
-    settings = resolve(options)
-    with joined(settings.device) as ranks:
+    given = given_options(context)
+    settings = complete(given, given.pop("preset", "default"))
+    with joined() as ranks:
         if ranks.first:
             click.echo(f"{settings.algo}: {settings.run_folder}", err=True)
         run = train(settings, show_progress=ranks.first, ranks=ranks)

@@ -7,36 +7,30 @@ driver's kernels are deterministic on a GPU.
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import click
 import torch
-from torch import Tensor
 
 from graspq.common.errors import UserError
 from graspq.common.provenance import code_revision, versions
 from graspq.datasets.dataset import open_shards
 from graspq.datasets.pool import ShardPool
-from graspq.train.augment import Augmentation
+from graspq.train.augment import augmented
 from graspq.train.batch import Batch
-from graspq.train.batches import batch_rows, held_back_batches, training_batches
+from graspq.train.batches import held_back_batches, training_batches
 from graspq.train.checkpoint import load_checkpoint, save_checkpoint
-from graspq.train.distributed import ALONE, WHOLE, BatchPart, Ranks, unite
-from graspq.train.estimators import Estimator, estimator_named
-from graspq.train.hardware import Precision, chosen_device, compile_networks, prepare
+from graspq.train.device import chosen_device, chosen_precision, prepare
+from graspq.train.estimator import Metrics
 from graspq.train.interruption import Interruption
-from graspq.train.networks import NetworkSpecification
-from graspq.train.opening import is_compiled, opened, precision_of
-from graspq.train.progress import Progress
+from graspq.train.networks.network import NetworkSpecification
+from graspq.train.parallel import ALONE, Ranks
+from graspq.train.progress import LOG_EVERY, Progress
 from graspq.train.run import Run
-from graspq.train.settings import TrainSettings
-from graspq.train.state import Context, Networks, TrainState, advance, learning_rate, new_state, seeded
-from graspq.train.updates import LINKS
+from graspq.train.settings import FREE, TrainSettings
+from graspq.train.state import TrainState, advance, learning_rate, new_state, seeded
 from graspq.train.validation import Validation, validate
-
-ACTIONS = 4
 
 
 class DivergedError(UserError):
@@ -52,7 +46,7 @@ def train(
         settings: everything about the run.
         stop_at: stop, with a checkpoint, after this step as if interrupted; None runs to the end.
         show_progress: show a progress bar on standard error.
-        ranks: those that train together, each calling this; see `distributed.joined`.
+        ranks: those that train together, each calling this; see `parallel.joined`.
 
     Raises:
         UserError: data, run folder or a setting are not usable; see the message.
@@ -76,10 +70,10 @@ def session(
     held_back: ShardPool,
     *,
     start: Path | None = None,
-    described: dict[str, Any] | None = None,
+    described: Mapping[str, Any] | None = None,
     ranks: Ranks = ALONE,
 ) -> Iterator["Session"]:
-    """Open a run's folder for these ranks alone: a new one, or the one that is there, at its newest checkpoint.
+    """Open a run's folder for this process alone: a new one, or the one that is there, at its newest checkpoint.
 
     Args:
         settings: everything about the run.
@@ -88,104 +82,95 @@ def session(
         held_back: part of the pool to validate on.
         start: checkpoint of another run that a new run goes on from; its own weights at step 0 where not given.
         described: further entries of `config.json`.
-        ranks: those that train together.
+        ranks: those that train together; the first alone writes.
 
     Raises:
         UserError: data, run folder or a setting are not usable; see the message.
     """
-    prepare(settings)
-    estimator = estimator_named(settings.algo)
-    discount = estimator.chosen_discount(settings.discount, pool.discount)
+    prepare(settings.threads)
+    row, device = settings.row, chosen_device(settings.device)
+    precision = chosen_precision(settings.precision, device)
     specification = NetworkSpecification(
-        settings.network, pool.image_shape, ACTIONS, pool.max_steps, LINKS[settings.loss], settings.width
+        name=settings.network,
+        image_shape=pool.image_shape,
+        action=pool.action,
+        steps=pool.max_steps,
+        link=row.loss(settings.own).link,
+        settings=settings.network_own.to_json(),
     )
-    device = chosen_device(settings.device)
-    state = new_state(specification, settings, device, estimator.parts)
-    if ranks.first and discount != pool.discount and (estimator.discount is None or not estimator.takes_discount):
-        stored = f"the data's are of discount {pool.discount:g}"
-        click.echo(f"{settings.algo}: returns are made from the rewards with discount {discount:g}; {stored}", err=True)
-    config = _configuration(settings, specification, pool, training, held_back, discount) | (described or {})
-    with opened(settings.run_folder, config, ranks) as run:
-        precision = ranks.from_first(lambda: precision_of(run, settings, specification, device))
-        compiled = ranks.from_first(lambda: is_compiled(run, settings, specification, precision))
-        newest = ranks.from_first(run.latest_checkpoint)
-        loaded = newest if newest is not None else start
-        if loaded is not None:
-            load_checkpoint(loaded, state, specification)
-        else:
-            # A new run alone: what reads all the data is not done again at every start.
-            state.extra = {name: tensor.to(device) for name, tensor in estimator.extra(training).items()}
-        run.forget_after(state.step)
-        ranks.spread(state.tensors)
-        unite(state.learned.values(), state.optimizers.values(), ranks)
-        if compiled:
-            compile_networks(state.networks.values())
-        saved = state.step if newest is not None else None
-        yield Session(settings, estimator, specification, run, state, precision, discount, held_back, ranks, saved)
-
-
-def _configuration(
-    settings: TrainSettings,
-    specification: NetworkSpecification,
-    pool: ShardPool,
-    training: ShardPool,
-    held_back: ShardPool,
-    discount: float,
-) -> dict[str, Any]:
-    """Return the content of a new run's `config.json`."""
-    return {
+    lagged = hasattr(settings.own, "lag_steps")
+    state = new_state(specification, row.parts, settings, settings.seed, precision, lagged=lagged, ranks=ranks)
+    config = {
         "command": "grasp-train",
         "settings": settings.to_json(),
-        "discount": discount,
-        "mc_return": "as stored" if discount == pool.discount else f"made from the rewards with discount {discount:g}",
+        "precision": precision.name,
         "network": specification.to_json(),
-        "dataset": {
-            "manifest_sha256": pool.manifest_digest,
-            "task": pool.task,
-            "action_limits": list(pool.action_limits),
-            "discount": pool.discount,
-            "object_set": pool.object_set,
-            "episodes": pool.episodes,
-            "training": {"blocks": len(training.blocks), "episodes": training.episodes, "rows": training.rows},
-            "held_back": {"blocks": len(held_back.blocks), "episodes": held_back.episodes, "rows": held_back.rows},
-        },
+        "dataset": _described(pool, training, held_back),
         "versions": versions("torch", "numpy", "pyarrow", "safetensors"),
         "code_revision": code_revision(),
+        **(described or {}),
+    }
+    with contextlib.ExitStack() as stack:
+
+        def opened() -> tuple[Run, Path | None]:
+            run = Run.create_or_resume(settings.run_folder, config, FREE)
+            stack.enter_context(run.locked())
+            return run, run.latest_checkpoint()
+
+        run, newest = ranks.from_first(opened)
+        if newest is not None or start is not None:
+            load_checkpoint(newest or start, state)  # type: ignore[arg-type]
+        else:
+            # A new run alone: what reads all the data is not done again at every start.
+            kept = row.kept(training, settings.own)
+            state.networks.kept.update({name: tensor.to(device) for name, tensor in kept.items()})
+        if ranks.first:
+            run.forget_after(state.step)
+        yield Session(settings, run, state, held_back, ranks, state.step if newest is not None else None)
+
+
+def _described(pool: ShardPool, training: ShardPool, held_back: ShardPool) -> dict[str, Any]:
+    """Return what `config.json` says of the data."""
+    parts = {"training": training, "held_back": held_back}
+    return {
+        "manifest_sha256": pool.manifest_digest,
+        "task": pool.task,
+        "action": pool.action.to_json(),
+        "discount": pool.discount,
+        "object_set": pool.object_set,
+        "episodes": pool.episodes,
+        **{
+            name: {"blocks": len(part.blocks), "episodes": part.episodes, "rows": part.rows}
+            for name, part in parts.items()
+        },
     }
 
 
 @dataclasses.dataclass
 class Session:
-    """One process's part of a run; see `session`."""
+    """A run whose folder is open; see `session`."""
 
     settings: TrainSettings
-    estimator: Estimator
-    specification: NetworkSpecification
     run: Run
     state: TrainState
-    precision: Precision
-    discount: float
     held_back: ShardPool
     ranks: Ranks = ALONE
     saved_step: int | None = None
-    watched: dict[str, Tensor] = dataclasses.field(default_factory=dict)
 
     def steps(self, pool: ShardPool, last: int, show_progress: bool) -> None:
         """Train on `pool` until step `last`, and leave a checkpoint of it."""
-        settings, state = self.settings, self.state
+        settings, state, ranks = self.settings, self.state, self.ranks
         if state.step >= last:
             return
-        pool = pool.with_discount(self.discount)
-        rows = batch_rows(pool, settings, self.estimator)
-        device, ranks = self.precision.device, self.ranks
-        source = training_batches(pool, settings, self.estimator, device, state.step, ranks)
-        progress = Progress(self.run, settings, state.step, show_progress)
+        pool = pool.with_discount(settings.own.chosen_discount(pool.discount))
+        device, wanted = state.networks.precision.device, settings.row.target_value
+        source = training_batches(pool, settings, wanted, device, state.step, ranks)
+        progress = Progress(self.run, settings, state.step, show_progress, ranks.first)
         with source as batches, progress, Interruption() as interruption:
             while state.step < last and not ranks.any(interruption.requested):
                 with progress.timed():
-                    batch = next(batches)
-                    loss = self.update(batch, BatchPart.of(ranks, rows, batch.real_steps))
-                progress.count(loss, self.watched)
+                    metrics = self.update(next(batches))
+                progress.count(metrics)
                 self._after_step(progress)
             if self.saved_step != state.step:
                 self._log(progress)
@@ -195,65 +180,32 @@ class Session:
         if interrupted:
             raise KeyboardInterrupt
 
-    def update(self, batch: Batch, part: BatchPart = WHOLE) -> Tensor:
-        """Take one step on a batch as the loader gives it; return its loss.
-
-        Args:
-            batch: this rank's.
-            part: which part of the whole batch that is.
-        """
-        settings = self.settings
-        augmentation = Augmentation(settings.shift, settings.mirror, settings.jitter, settings.action_noise)
-        batch = augmentation(batch, seeded("train/augment", settings.seed, self.state.step), part)
-        rate = learning_rate(settings, self.state.step)
-        for optimizer in self.state.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = rate
-        generator = seeded("train/candidates", settings.seed, self.state.step)
-        context = self._context(self.state.learned, generator, part)
-        loss = self.estimator.update(self.state, batch, self.estimator, context)
-        advance(self.state, settings)
-        for name, value in self.watched.items():
-            self.watched[name] = part.mean(value)
-        return part.mean(loss)
-
-    def _context(self, networks: Networks, generator: torch.Generator, part: BatchPart = WHOLE) -> Context:
-        return Context(
-            networks=networks,
-            lagged_networks=self.state.lagged,
-            loss=self.settings.loss,
-            discount=self.discount,
-            candidates=self.settings.candidates,
-            generator=generator,
-            progress=self.state.step / self.settings.steps,
-            autocast=self.precision.autocast,
-            extra=self.state.extra,
-            anneal=self.settings.anneal,
-            centred=self.settings.centred,
-            mirror=self.settings.mirror,
-            actor_rest=self.settings.actor_rest,
-            actor_rate=self.settings.actor_rate,
-            actor_every=self.settings.actor_every,
-            path_steps=self.settings.path_steps,
-            penalty=self.settings.penalty,
-            kl_bound=self.settings.kl_bound,
-            watched=self.watched,
-            part=part,
-        )
+    def update(self, batch: Batch) -> Metrics:
+        """Take one step on a batch as the loader gives it; return what its update measured."""
+        settings, state = self.settings, self.state
+        # Ranks have numbers of their own; those of one process do not depend on how many there could be.
+        keys = (settings.seed, state.step, *([self.ranks.rank] if self.ranks.count > 1 else []))
+        mirror = state.networks.specification.action.mirror if settings.mirror else None
+        batch = augmented(batch, settings.shift, mirror, seeded("train/augment", *keys))
+        rate = learning_rate(settings, state.step)
+        for part in state.optimizers:
+            state.set_rate(part, rate)
+        row, random, progress = settings.row, seeded("train/candidates", *keys), state.step / settings.steps
+        metrics = row.update(row, state, batch, settings.own, random, progress)
+        advance(state, settings.average_decay, getattr(settings.own, "lag_steps", None))
+        return metrics
 
     def _after_step(self, progress: Progress) -> None:
         """Log, validate and save where it is time to."""
         settings, step = self.settings, self.state.step
-        finished = step >= settings.steps
-        saves = finished or step % settings.checkpoint_every == 0
-        if saves or step % settings.log_every == 0:
+        saves = step >= settings.steps or step % settings.save_every == 0
+        if saves or step % LOG_EVERY == 0:
             self._log(progress)
-        if finished or step % settings.validate_every == 0:
+        if saves:
             self._check_weights()
             result = self.validate() if self.ranks.first else None
             if result is not None:
                 progress.log_validation(step, result)
-        if saves:
             self.save()
 
     def _log(self, progress: Progress) -> None:
@@ -263,13 +215,15 @@ class Session:
 
     def validate(self) -> Validation | None:
         """Judge the policy's networks on held-back transitions; the same ones and the same candidates each time."""
-        context = self._context(self.state.acting, seeded("train/validation", self.settings.seed))
-        held_back = self.held_back.with_discount(self.discount)
-        batches = held_back_batches(held_back, self.settings, self.estimator, self.precision.device)
-        return validate(batches, self.estimator, context)
+        settings, state = self.settings, self.state
+        pool = self.held_back.with_discount(settings.own.chosen_discount(self.held_back.discount))
+        device = state.networks.precision.device
+        batches = held_back_batches(pool, settings, settings.row.target_value, device)
+        random, progress = seeded("train/validation", settings.seed), state.step / settings.steps
+        return validate(batches, settings.row, state.acting, settings.own, random, progress)
 
     def _check_weights(self) -> None:
-        for name, network in self.state.networks.items():
+        for name, network in self.state.named_networks.items():
             for part, tensor in network.state_dict().items():
                 if not bool(torch.isfinite(tensor).all()):
                     self._diverged(self.state.step, f"{part} of the {name} network is not finite")
@@ -280,13 +234,14 @@ class Session:
             return
         self._check_weights()
         if self.ranks.first:
-            save_checkpoint(self.run.checkpoints_folder, self.state, self.specification)
-        self.run.prune(self.settings.keep_checkpoints)
+            save_checkpoint(self.run.checkpoints_folder, self.state)
+            self.run.prune()
         self.saved_step = self.state.step
 
     def _diverged(self, step: int, found: str) -> None:
         # What an update found was so with the weights that the one before it had left.
-        self.run.forget_checkpoints_from(step - 1)
+        if self.ranks.first:
+            self.run.forget_checkpoints_from(step - 1)
         newest = self.run.latest_checkpoint()
         kept = f"{newest} is the last good checkpoint" if newest is not None else "no good checkpoint was written yet"
         raise DivergedError(

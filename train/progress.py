@@ -7,32 +7,34 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from graspq.train.estimator import Metrics
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
 from graspq.train.validation import Validation
 
-# Of mean absolute values of returns, which lie in [0, 1]. Its square is that of the loss: where Q is a probability it
-# cannot leave its range, but the outputs behind it can.
+# Of what an update measures: means of absolute values that returns, which lie in [0, 1], keep near it. Its square is
+# that of the loss: where Q is a probability it cannot leave its range, but the outputs behind it can.
 LARGEST = 10.0
+LOG_EVERY = 50
 
 
 class Progress:
     """Collects losses and times between two rows of metrics; a context manager."""
 
-    def __init__(self, run: Run, settings: TrainSettings, step: int, show: bool) -> None:
+    def __init__(self, run: Run, settings: TrainSettings, step: int, show: bool, writes: bool) -> None:
         # Imported here: it takes a second, and most users of this module's neighbours do not need it.
         from torch.utils.tensorboard import SummaryWriter
 
-        self._run, self._batch_size = run, settings.batch_size
+        self._run, self._batch_size, self._writes = run, settings.batch_size, writes
         folder = str(run.folder / "tensorboard")
-        self._writer = SummaryWriter(folder, purge_step=step + 1) if run.writes else None
+        self._writer = SummaryWriter(folder, purge_step=step + 1) if writes else None
         # A log file gets a line every half minute instead of a moving bar.
         interval = 0.5 if sys.stderr.isatty() else 30.0
         self._bar = tqdm(
@@ -46,8 +48,7 @@ class Progress:
             dynamic_ncols=True,
         )
         self._shown: dict[str, str] = {}
-        self._losses: list[Tensor] = []
-        self._watched: dict[str, list[Tensor]] = {}
+        self._measured: dict[str, list[Tensor]] = {}
         self._first = step + 1
         self._seconds = 0.0
 
@@ -66,68 +67,61 @@ class Progress:
         yield
         self._seconds += time.perf_counter() - start
 
-    def count(self, loss: Tensor, watched: Mapping[str, Tensor]) -> None:
-        """Note a step that was taken: its loss, and mean absolute values that the task keeps near [0, 1], by name."""
-        self._losses.append(loss)
-        for name, value in watched.items():
-            self._watched.setdefault(name, []).append(value.detach())
+    def count(self, metrics: Metrics) -> None:
+        """Note a step that was taken: its loss, and what else its update measured, by name."""
+        for name, value in metrics.items():
+            self._measured.setdefault(name, []).append(value.detach())
         self._bar.update(1)
 
     def log(self, step: int, learning_rate: float) -> tuple[int, str] | None:
-        """Write a row for the steps since the last one, unless they diverged.
+        """Write a row for the steps since the last one, unless they diverged: means over these steps.
 
         Returns:
             The first step that diverged and what was found there, else None. Returns lie in [0, 1]: a mean beyond ±10
             is no estimate of one, nor is one whose loss is beyond ±100.
         """
-        if not self._losses:
+        if not self._measured:
             return None
         start = time.perf_counter()
-        losses = torch.stack(self._losses).cpu()
+        measured = {name: torch.stack(values).cpu() for name, values in self._measured.items()}
         self._seconds += time.perf_counter() - start
-        diverged = self._diverged(losses)
+        diverged = self._diverged(measured)
         if diverged is not None:
             return diverged
-        rate = len(losses) * self._batch_size / self._seconds
-        row = {
-            "step": step,
-            "loss": float(losses.mean()),
-            "samples_per_second": round(rate, 1),
-            "learning_rate": learning_rate,
-        }
-        self._run.append_metrics(row)
-        self._to_tensorboard("train", {name: value for name, value in row.items() if name != "step"}, step)
+        rate = len(measured["loss"]) * self._batch_size / self._seconds
+        row: dict[str, Any] = {"step": step, **{name: float(values.mean()) for name, values in measured.items()}}
+        row |= {"samples_per_second": round(rate, 1), "learning_rate": learning_rate}
+        self._write("train", row, {name: value for name, value in row.items() if name != "step"}, step)
         self._show({"loss": f"{row['loss']:.4f}", "samples/s": f"{rate:.0f}"})
-        self._losses, self._first, self._seconds = [], step + 1, 0.0
-        self._watched = {}
+        self._measured, self._first, self._seconds = {}, step + 1, 0.0
         return None
 
-    def _diverged(self, losses: Tensor) -> tuple[int, str] | None:
-        watched = {name: torch.stack(values).cpu() for name, values in self._watched.items()}
-        for index, loss in enumerate(losses.tolist()):
+    def _diverged(self, measured: Metrics) -> tuple[int, str] | None:
+        for index, loss in enumerate(measured["loss"].tolist()):
             if not math.isfinite(loss):
                 return self._first + index, "loss is not finite"
-            for name, values in watched.items():
+            for name, values in measured.items():
                 value = float(values[index])
-                if not abs(value) <= LARGEST:
-                    return self._first + index, f"mean |{name}| is {value:.3g}, and returns lie in [0, 1]"
-            if abs(loss) > LARGEST**2:
-                return self._first + index, f"loss is {loss:.3g}, and returns lie in [0, 1]"
+                if not abs(value) <= (LARGEST**2 if name == "loss" else LARGEST):
+                    what = name if name == "loss" else f"mean |{name}|"
+                    return self._first + index, f"{what} is {value:.3g}, and returns lie in [0, 1]"
         return None
 
     def log_validation(self, step: int, result: Validation) -> None:
         """Write a row of validation."""
         values = result.to_json()
-        self._run.append_metrics({"step": step, "validation": values})
-        self._to_tensorboard("validation", values, step)
+        self._write("validation", {"step": step, "validation": values}, values, step)
         shown = {"held-back": f"{result.loss:.4f}"}
         if result.roc_auc_last_step is not None:
             shown["AUC"] = f"{result.roc_auc_last_step:.3f}"
         self._show(shown)
 
-    def _to_tensorboard(self, group: str, values: dict[str, Any], step: int) -> None:
+    def _write(self, group: str, row: dict[str, Any], values: dict[str, Any], step: int) -> None:
+        if self._writer is None:
+            return
+        self._run.append_metrics(row)
         for name, value in values.items():
-            if self._writer is not None and isinstance(value, int | float):
+            if isinstance(value, int | float):
                 self._writer.add_scalar(f"{group}/{name}", value, step)
 
     def _show(self, values: dict[str, str]) -> None:

@@ -54,7 +54,7 @@ class ResidentPool:
             image = torch.empty(pool.rows, *pool.image_shape, dtype=torch.uint8, device=device)
         except RuntimeError:
             raise UserError(
-                f"--resident: {image_bytes(pool) / 2**30:.1f} GiB of images do not fit on {device}; use --resident no"
+                f"--resident: {image_bytes(pool) / 2**30:.1f} GiB of images do not fit on {device}; leave it out"
             ) from None
         blocks: list[BlockArrays] = []
         row = 0

@@ -4,34 +4,24 @@ It holds `config.json`, `metrics.jsonl`, `tensorboard/` and `checkpoints/step-NN
 """
 
 import contextlib
-import fcntl
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
-from graspq.common.files import read_json, remove_temporaries, writable_folder, write_json, write_text
-
-# Settings that may differ when a run is resumed: they do not decide what is learned.
-FREE_SETTINGS = frozenset(
-    {
-        "shards",  # the data may have moved: their digest is compared instead
-        "out",
-        "validation_transitions",
-        "validate_every",
-        "checkpoint_every",
-        "keep_checkpoints",
-        "log_every",
-        "device",
-        "precision",
-        "resident",
-        "compile",
-        "threads",
-    }
+from graspq.common.files import (
+    locked,
+    read_json,
+    remove_folder,
+    remove_temporaries,
+    writable_folder,
+    write_json,
+    write_text,
 )
+
+KEPT_CHECKPOINTS = 3
 
 
 def checkpoint_name(step: int) -> str:
@@ -51,10 +41,7 @@ class Run:
     Attributes:
         folder: the folder.
         config: the content of `config.json`.
-        writes: whether this process writes the folder; see `Witness`.
     """
-
-    writes = True
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
@@ -73,10 +60,10 @@ class Run:
         return cls(folder, config)
 
     @classmethod
-    def create_or_resume(cls, folder: Path, config: dict[str, Any]) -> "Run":
+    def create_or_resume(cls, folder: Path, config: dict[str, Any], free: frozenset[str]) -> "Run":
         """Return the run of this configuration in `folder`: a new one, or the one that is there.
 
-        A run that is there keeps its own `config.json`.
+        A run that is there keeps its own `config.json`; settings in `free` may differ from it.
 
         Raises:
             UserError: the folder holds something else or a run of another configuration, or cannot be written.
@@ -88,12 +75,12 @@ class Run:
             write_json(folder / "config.json", config)
             return cls(folder, config)
         run = cls.open(folder)
-        run._refuse_other(config)
+        run._refuse_other(config, free)
         return run
 
-    def _refuse_other(self, config: dict[str, Any]) -> None:
+    def _refuse_other(self, config: dict[str, Any], free: frozenset[str]) -> None:
         ours, theirs = self.config["settings"], config["settings"]
-        for name in sorted((ours.keys() | theirs.keys()) - FREE_SETTINGS):
+        for name in sorted((ours.keys() | theirs.keys()) - free):
             if ours.get(name) != theirs.get(name):
                 raise UserError(
                     f"{self.folder}: holds a run with {name} = {ours.get(name)}, not {theirs.get(name)}; "
@@ -107,24 +94,16 @@ class Run:
                     "choose another folder with --out, or delete it"
                 )
 
-    def note(self, name: str, value: Any) -> None:
-        """Add an entry to `config.json`."""
-        self.config[name] = value
-        write_json(self.folder / "config.json", self.config)
-
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the run for this process alone.
+        """Hold the run for this process alone, and remove what killed writers left.
 
         Raises:
             UserError: another process trains in it.
         """
-        with (self.folder / ".lock").open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise UserError(f"{self.folder}: another process trains here; wait for it, or use --out") from None
+        with locked(self.folder, "training"):
             remove_temporaries(self.folder)
+            remove_temporaries(self.checkpoints_folder)
             yield
 
     @property
@@ -154,16 +133,16 @@ class Run:
             raise UserError(f"{self.folder}: has no checkpoint of step {step}, only of {', '.join(map(str, known))}")
         return known[step] if step is not None else self.checkpoints()[-1]
 
-    def prune(self, keep: int) -> None:
-        """Remove all but the newest `keep` checkpoints."""
-        for path in self.checkpoints()[:-keep]:
-            shutil.rmtree(path)
+    def prune(self) -> None:
+        """Remove all but the newest checkpoints."""
+        for path in self.checkpoints()[:-KEPT_CHECKPOINTS]:
+            remove_folder(path)
 
     def forget_checkpoints_from(self, step: int) -> None:
         """Remove the checkpoints of a step and of later ones."""
         for path in self.checkpoints():
             if (step_of(path) or 0) >= step:
-                shutil.rmtree(path)
+                remove_folder(path)
 
     @property
     def metrics_file(self) -> Path:
@@ -173,8 +152,8 @@ class Run:
     def metrics(self) -> list[dict[str, Any]]:
         """Return the rows of `metrics.jsonl`; a line that a crash cut short is left out.
 
-        A row of training has `step, loss, samples_per_second, learning_rate`, one of validation
-        `step, validation: {...}`; see `validation.Validation`.
+        A row of training has `step, loss, samples_per_second, learning_rate` and what the estimator's update measured,
+        one of validation `step, validation: {...}`; see `validation.Validation`.
         """
         if not self.metrics_file.exists():
             return []
@@ -192,25 +171,3 @@ class Run:
         rows = [row for row in self.metrics() if row["step"] <= step]
         if self.metrics_file.exists():
             write_text(self.metrics_file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
-
-
-class Witness(Run):
-    """The run as seen by a process that trains with the one that writes it: it reads, and its writing does nothing."""
-
-    writes = False
-
-    def note(self, name: str, value: Any) -> None:
-        """Keep an entry of `config.json` in memory."""
-        self.config[name] = value
-
-    def prune(self, keep: int) -> None:
-        """Do nothing."""
-
-    def forget_checkpoints_from(self, step: int) -> None:
-        """Do nothing."""
-
-    def append_metrics(self, row: dict[str, Any]) -> None:
-        """Do nothing."""
-
-    def forget_after(self, step: int) -> None:
-        """Do nothing."""

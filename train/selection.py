@@ -1,22 +1,26 @@
-"""How an action is picked from a Q-function: stochastic search, by uniform draws or by the cross-entropy method.
+"""The two ways to pick an action: stochastic search (uniform draws, the cross-entropy method) and an actor network.
 
-Both are pure functions of a Q-function of actions and of random numbers that the caller draws, so that one state's
+Searches are pure functions of a Q-function of actions and of random numbers that the caller draws, so that one state's
 choice does not depend on which other states share its batch. Dimensions: B batch, N candidates, A action, I iterations.
 """
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import ClassVar, Literal, NamedTuple, Protocol, cast
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from graspq.common.action_space import ActionSpace
+from graspq.common.errors import UserError
+from graspq.common.options import Settings, setting
+from graspq.train.networks.network import QNetwork
 
 QOfActions = Callable[[Tensor], Tensor]
 """Q of candidate actions, [B, N, A] -> [B, N], for B states that are fixed inside it."""
 Answer = Literal["mean", "best"]
 StepMode = Literal["scale", "clip"]
-# Where the cross-entropy method starts: straight down, (dx, dy, dz, dphi).
-START_MEAN = (0.0, 0.0, -1.0, 0.0)
-START_DEVIATION = 0.5
 # How far outside the box an actor may point.
 FARTHEST_POINT = 1.25
 
@@ -44,25 +48,18 @@ class SearchSpace(NamedTuple):
     high: Tensor
 
 
-def single_steps(near: Tensor) -> SearchSpace:
-    """Return the space of one step's actions, [-1, 1]ᴬ started straight down; of the type and place of `near`."""
-    mean = torch.tensor([START_MEAN], device=near.device, dtype=near.dtype)
+def single_steps(action: ActionSpace, near: Tensor) -> SearchSpace:
+    """Return the space of one step's actions, [-1, 1]ᴬ from where the action space says; type and device of `near`."""
+    mean = torch.tensor([action.start], device=near.device, dtype=near.dtype)
     return SearchSpace(
-        mean, torch.full_like(mean, START_DEVIATION), torch.full_like(mean, -1), torch.full_like(mean, 1)
+        mean, torch.full_like(mean, action.deviation), torch.full_like(mean, -1), torch.full_like(mean, 1)
     )
 
 
-def uniform_actions(generator: torch.Generator, batch: int, candidates: int = 16, dimensions: int = 4) -> Tensor:
+def uniform_actions(generator: torch.Generator, batch: int, candidates: int, dimensions: int) -> Tensor:
     """Draw candidate actions aᵢ ~ U[-1, 1]ᴬ on the generator's device; float32 [B, N, A]."""
     draws = torch.rand(batch, candidates, dimensions, generator=generator, device=generator.device)
     return draws * 2 - 1
-
-
-def cem_noise(
-    generator: torch.Generator, batch: int, iterations: int = 3, samples: int = 64, dimensions: int = 4
-) -> Tensor:
-    """Draw the standard normal numbers of a `cross_entropy_method` on the generator's device; float32 [I, B, N, A]."""
-    return torch.randn(iterations, batch, samples, dimensions, generator=generator, device=generator.device)
 
 
 def uniform_search(q_of_actions: QOfActions, candidates: Tensor) -> Choice:
@@ -85,10 +82,10 @@ def uniform_search(q_of_actions: QOfActions, candidates: Tensor) -> Choice:
 def cross_entropy_method(
     q_of_actions: QOfActions,
     noise: Tensor,
+    space: SearchSpace,
     *,
     elites: int = 10,
     answer: Answer = "mean",
-    space: SearchSpace | None = None,
 ) -> Choice:
     """Return the action that the cross-entropy method ends at.
 
@@ -99,10 +96,9 @@ def cross_entropy_method(
     Args:
         q_of_actions: Q-function of candidates.
         noise: standard normal numbers, float [I, B, N, A]; its shape says how many iterations and samples there are.
-            See `cem_noise`.
+        space: μ₀, σ₀, low and high.
         elites: how many of the N samples a normal distribution is fitted to, 2 to N.
         answer: see above. Where Q is learned the mean is the better action: the best sample is often a false peak.
-        space: μ₀, σ₀, low and high; by default those of one step: μ₀ = (0, 0, -1, 0), σ₀ = 0.5 in [-1, 1].
 
     Returns:
         The action and its Q.
@@ -111,9 +107,7 @@ def cross_entropy_method(
         ValueError: `noise` has not four dimensions or `elites` is not between 2 and N.
 
     Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning" (3 iterations, 64 samples).
-    Start and number of elites are the released code's. Where the search starts matters: the data descend in nine of ten
-    actions, and a search that starts evenly finds actions that Q has hardly seen and overrates; a `dql` policy then
-    hovers until T (one measured run: success 0 of 300 against 52 of 100).
+    Start and number of elites are the released code's. Where the search starts matters: see docs/estimators/dql.md.
     Differs: the released code does not clip, and takes the best of the last iteration; the answer is the mean here.
     """
     if noise.dim() != 4 or not 2 <= elites <= noise.shape[2]:
@@ -121,7 +115,7 @@ def cross_entropy_method(
             f"expected noise [iterations, batch, samples, action] and 2 to {noise.shape[-2]} elites, "
             f"got noise {list(noise.shape)} and {elites} elites"
         )
-    start, spread, low, high = (bound.unsqueeze(1) for bound in (single_steps(noise) if space is None else space))
+    start, spread, low, high = (bound.unsqueeze(1) for bound in space)
     candidates = (start + spread * noise[0]).clamp(low, high)
     q = q_of_actions(candidates)
     best = _best(candidates, q)
@@ -136,24 +130,25 @@ def cross_entropy_method(
     return Choice(mean.squeeze(1), q_of_actions(mean).squeeze(1))
 
 
-def pointed(output: Tensor) -> Tensor:
+def pointed(output: Tensor, action: ActionSpace) -> Tensor:
     """Return where an actor network points: its action, but for the clipping to [-1, 1].
 
-        direction = c f(output + f⁻¹(START_MEAN / c)),  f(x) = x / √(1 + x²),  c = 1.25
+        direction = c f(output + f⁻¹(start / c)),  f(x) = x / √(1 + x²),  c = 1.25
 
-    An output of 0 is straight down, where the search starts too. Nine of ten logged actions have dz = -1: a function
-    that ended there would get to them at infinity only, and would hardly learn near them. f, because the gradient of
-    tanh dies so fast that an actor which overshot into a corner never came back (measured with `ddpg`).
+    An output of 0 is the start of a search. Where many logged actions lie at a bound, a function that ended there would
+    get to them at infinity only; f, because the gradient of tanh dies so fast that an actor which overshot into a
+    corner never came back.
 
     Args:
         output: raw outputs of a state network, float [..., A].
+        action: says where a search starts.
 
     Returns:
         float32 [..., A] in (-1.25, 1.25); clip it to act.
 
     Source: the released code's actor is linear and unbounded.
     """
-    start = torch.tensor(START_MEAN, device=output.device) / FARTHEST_POINT
+    start = torch.tensor(action.start, device=output.device) / FARTHEST_POINT
     shifted = output.float() + start * torch.rsqrt(1 - start.square())
     return FARTHEST_POINT * shifted * torch.rsqrt(1 + shifted.square())
 
@@ -174,6 +169,133 @@ def one_step_of(displacement: Tensor, mode: StepMode) -> Tensor:
     if mode == "clip":
         return displacement.clamp(-1, 1)
     return displacement / displacement.abs().amax(-1, keepdim=True).clamp(min=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class CemSettings(Settings):
+    """The search by which a Q-function acts; see `cross_entropy_method`.
+
+    Source: Quillen et al. 2018 (3 iterations of 64 samples).
+    """
+
+    iterations: int = setting(3, help="Iterations of CEM.", minimum=1, maximum=100)
+    samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
+    elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
+    answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
+    synthetic_step: StepMode = setting(
+        "scale", help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them."
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges, and that there are no more elites than samples.
+
+        Raises:
+            UserError: one of them does not hold.
+        """
+        super().__post_init__()
+        if self.elites > self.samples:
+            raise UserError(f"CEM elites: expected at most as many as samples ({self.samples}), got {self.elites}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Acting:
+    """What a run acts with.
+
+    Attributes:
+        networks: by part, in evaluation mode.
+        kept: tensors that the estimator keeps besides.
+        action: what an action means.
+        pose_bounds: least and greatest pose that the gripper is commanded to, float [A] each, where they are known.
+    """
+
+    networks: Mapping[str, nn.Module]
+    kept: Mapping[str, Tensor]
+    action: ActionSpace
+    pose_bounds: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def q(self) -> QNetwork:
+        """Q(s, a)."""
+        return cast(QNetwork, self.networks["q"])
+
+
+class ActionSelection(Protocol):
+    """How the policy of an estimator finds its action, and the paper's words for it."""
+
+    words: ClassVar[str]
+
+    def act(
+        self,
+        acting: Acting,
+        image: Tensor,
+        step: Tensor,
+        pose: Tensor | None,
+        random: np.random.Generator,
+        cem: CemSettings,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the action for one state, float32 [1, A] in [-1, 1], and what it is worth, float32 [1] or None.
+
+        Args:
+            acting: networks and whatever else a run acts with.
+            image: uint8 [1, H, W, C].
+            step: int64 [1], actions taken so far.
+            pose: of the gripper, float32 [1, A], where it is known; no network sees it.
+            random: all noise of the decision.
+            cem: settings of a search.
+        """
+
+
+class StochasticSearch:
+    """The cross-entropy method over the actions of one step."""
+
+    words: ClassVar[str] = "stochastic search"
+
+    def act(
+        self,
+        acting: Acting,
+        image: Tensor,
+        step: Tensor,
+        pose: Tensor | None,
+        random: np.random.Generator,
+        cem: CemSettings,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Search an action; see `ActionSelection.act`."""
+        shape = (cem.iterations, 1, cem.samples, acting.action.size)
+        noise = torch.from_numpy(random.standard_normal(shape, dtype=np.float32)).to(image.device)
+        space = self.space(acting, noise, step, pose)
+        found = cross_entropy_method(acting.q.at(image, step), noise, space, elites=cem.elites, answer=cem.answer)
+        return self.executed(found.action.float(), cem).clamp(-1, 1), found.q.float()
+
+    def space(self, acting: Acting, near: Tensor, step: Tensor, pose: Tensor | None) -> SearchSpace:
+        """Return where the search starts and may go; tensors of the type and on the device of `near`."""
+        return single_steps(acting.action, near)
+
+    def executed(self, found: Tensor, cem: CemSettings) -> Tensor:
+        """Return the action, [1, A], for what the search found."""
+        return found
+
+
+class ActorNetwork:
+    """The action that the actor network points at: the mean where its policy is a distribution."""
+
+    words: ClassVar[str] = "actor network"
+
+    def act(
+        self,
+        acting: Acting,
+        image: Tensor,
+        step: Tensor,
+        pose: Tensor | None,
+        random: np.random.Generator,
+        cem: CemSettings,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Ask the actor; its worth is Q(s, a) where there is a Q-function, else V(s). See `ActionSelection.act`."""
+        output = acting.networks["actor"](image, step)[:, : acting.action.size]
+        action = pointed(output, acting.action).clamp(-1, 1)
+        if "q" in acting.networks:
+            return action, acting.q.at(image, step)(action.unsqueeze(1)).squeeze(1).float()
+        value = acting.networks["v"](image, step).squeeze(-1).float() if "v" in acting.networks else None
+        return action, value
 
 
 def _elite_moments(candidates: Tensor, q: Tensor, elites: int) -> tuple[Tensor, Tensor]:

@@ -146,6 +146,40 @@ def bootstrapped(reward: Tensor, terminal: Tensor, next_value: Tensor, discount:
     return reward + discount * torch.where(terminal, torch.zeros_like(next_value), next_value)
 
 
+def blended(
+    reward: Tensor, value: Tensor, advantage: Tensor, weight: Tensor, discount: float, mask: Tensor | None = None
+) -> Tensor:
+    """Return targets between the bootstrapped and the corrected episode value.
+
+        y_t = r_t + γ [(1 - λ_{t+1}) V(s_{t+1}) + λ_{t+1} (y_{t+1} - A(s_{t+1}, a_{t+1}))],  y_T = r_T
+
+    With λ = 0 this is the bootstrapped target, with λ = 1 the corrected episode value with ν = 1.
+
+    Args:
+        reward: float [B, T], whole episodes.
+        value: V(s_t), float [B, T]; at first steps it is not read.
+        advantage: A(s_t, a_t), float [B, T]; at first steps it is not read.
+        weight: λ_t in [0, 1], float [B, T]; at first steps it is not read.
+        discount: γ in [0, 1].
+        mask: bool [B, T], false where an episode has already ended; nothing is read there and the result is 0.
+
+    Returns:
+        float [B, T].
+
+    Source: none in the paper. With one λ for all it is Q*(λ) of Harutyunyan et al. 2016, "Q(λ) with Off-Policy
+    Corrections", equation 4, for the greedy policy.
+    """
+    real = torch.ones_like(reward, dtype=torch.bool) if mask is None else mask
+    result = torch.zeros_like(reward)
+    following = torch.zeros_like(reward[:, 0])
+    for t in reversed(range(reward.shape[1])):
+        y = reward[:, t] + discount * following
+        result[:, t] = torch.where(real[:, t], y, torch.zeros_like(y))
+        mixed = (1 - weight[:, t]) * value[:, t] + weight[:, t] * (y - advantage[:, t])
+        following = torch.where(real[:, t], mixed, torch.zeros_like(mixed))
+    return result
+
+
 def _check_shapes(reference: Tensor, *others: Tensor | None) -> None:
     for other in (reference, *others):
         if other is not None and (other.dim() != 2 or other.shape != reference.shape):

@@ -13,8 +13,8 @@ import numpy.typing as npt
 import torch
 
 from graspq.train.batch import Batch
-from graspq.train.estimators import Estimator
-from graspq.train.state import Context
+from graspq.train.estimator import Estimator, S
+from graspq.train.state import Networks
 
 Floats = npt.NDArray[np.floating[Any]]
 BINS = 10
@@ -49,22 +49,38 @@ class Validation:
 
 
 @torch.no_grad()
-def validate(batches: Iterable[Batch], estimator: Estimator, context: Context) -> Validation | None:
-    """Judge the context's networks on batches, in evaluation mode; None where there are none."""
-    for network in context.networks.values():
+def validate(
+    batches: Iterable[Batch],
+    row: Estimator[S],
+    networks: Networks,
+    settings: S,
+    random: torch.Generator,
+    progress: float,
+) -> Validation | None:
+    """Judge networks on batches, in evaluation mode; None where there are none.
+
+    Args:
+        batches: held back from training.
+        row: the estimator.
+        networks: to be judged.
+        settings: of the estimator.
+        random: random numbers of the targets.
+        progress: part of the training that is done, in [0, 1].
+    """
+    for network in networks.online.values():
         network.eval()
     total, count, last_steps = 0.0, 0, 0
     scores, rewards = [], []
     for batch in batches:
         size = int(batch.real_steps)
-        total += float(estimator.objective(batch, estimator, context)) * size
+        total += float(row.objective(row, batch, networks, settings, random, progress)) * size
         count += size
         last = batch.real(batch.terminal)
         last_steps += int(last.sum())
-        if "q" in estimator.parts:
-            with context.autocast():
-                q_at_last = context.network.at(batch.real(batch.image)[last], batch.real(batch.step)[last])
-                score = q_at_last(batch.real(estimator.action(batch))[last].unsqueeze(1)).squeeze(1)
+        if "q" in row.parts:
+            with networks.autocast():
+                q_at_last = networks.q.at(batch.real(batch.image)[last], batch.real(batch.step)[last])
+                score = q_at_last(batch.real(row.action(batch))[last].unsqueeze(1)).squeeze(1)
             scores.append(score.float().cpu().numpy())
             rewards.append(batch.real(batch.reward)[last].cpu().numpy())
     if count == 0:

@@ -1,4 +1,4 @@
-"""What a Q-network is, and the table of networks that `--network` chooses from.
+"""What a Q-network is, and what must be known to build one.
 
 A Q-network computes everything that depends on the state alone once, in its trunk, and judges any number of candidate
 actions with a light head. Dimensions: B batch, N candidates, A action, O outputs, H W C image.
@@ -6,12 +6,13 @@ actions with a light head. Dimensions: B batch, N candidates, A action, O output
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
-import torch
 from torch import Tensor, nn
 
+from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
+from graspq.common.options import Settings
 
 Features = tuple[Tensor, ...]
 Link = Literal["logistic", "identity"]
@@ -76,23 +77,39 @@ class StateNetwork(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True)
+class NetworkSettings(Settings):
+    """Options of a network; those of `--network` follow the common ones."""
+
+
+@dataclasses.dataclass(frozen=True)
 class NetworkSpecification:
     """Everything needed to build a network again: what a checkpoint says about itself.
 
-    `image_shape` is (H, W, C), `actions` the number of action dimensions, `steps` T, the most steps of an episode.
-    `width` is the number of channels and units of the paper's network; the default network has its own.
+    Attributes:
+        name: of `--network`.
+        image_shape: (H, W, C).
+        action: what an action means; A is its size.
+        steps: T, the most steps of an episode.
+        link: what makes Q of a raw output.
+        settings: the network's own options, as JSON.
     """
 
     name: str
     image_shape: tuple[int, int, int]
-    actions: int
+    action: ActionSpace
     steps: int
     link: Link
-    width: int = 32
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def actions(self) -> int:
+        """A, the number of parts of an action."""
+        return self.action.size
 
     def to_json(self) -> dict[str, Any]:
         """Return the specification as plain JSON values."""
-        return dataclasses.asdict(self) | {"image_shape": list(self.image_shape)}
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return values | {"image_shape": list(self.image_shape), "action": self.action.to_json()}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "NetworkSpecification":
@@ -105,72 +122,13 @@ class NetworkSpecification:
         if set(values) != names or values["link"] not in get_args(Link) or len(values["image_shape"]) != 3:
             raise UserError(f"network specification {values!r}: expected {', '.join(sorted(names))}; train again")
         height, width, channels = values["image_shape"]
-        return cls(**values | {"image_shape": (int(height), int(width), int(channels))})
+        shape = (int(height), int(width), int(channels))
+        return cls(**values | {"image_shape": shape, "action": ActionSpace.from_json(values["action"])})
 
 
-def make_network(specification: NetworkSpecification, generator: torch.Generator | None = None) -> QNetwork:
-    """Return a freshly initialised Q-network on the CPU.
-
-    Args:
-        specification: which network, for which states and actions.
-        generator: seeds the initial weights: they are a function of its next draw. Without one they follow torch's
-            global generator, which is right only where a checkpoint overwrites them.
-
-    Raises:
-        UserError: the name is unknown, or the images are too small for the network.
-    """
-    network = _seeded(generator, lambda: _family(specification).q(specification))
-    network.link = specification.link
-    # torch's annotations do not know that modules take a memory format.
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
-
-
-def make_state_network(
-    specification: NetworkSpecification, outputs: int, generator: torch.Generator | None = None
-) -> StateNetwork:
-    """Return a freshly initialised function of the state with O = `outputs` outputs; see `make_network`."""
-    network = _seeded(generator, lambda: _family(specification).state(specification, outputs))
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
-
-
-Module = TypeVar("Module", bound=nn.Module)
-
-
-def _seeded(generator: torch.Generator | None, make: Callable[[], Module]) -> Module:
-    if generator is None:
-        return make()
-    seed = int(torch.randint(2**62, (), generator=generator))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return make()
-
-
-class _Family(NamedTuple):
-    """The networks of one `--network`."""
+class NetworkFamily(NamedTuple):
+    """The networks of one `--network`: makers of Q(s, a) and of functions of the state, and their common options."""
 
     q: Callable[[NetworkSpecification], QNetwork]
     state: Callable[[NetworkSpecification, int], StateNetwork]
-
-
-def _family(specification: NetworkSpecification) -> _Family:
-    if specification.name not in NETWORKS:
-        raise UserError(f"--network: {specification.name!r} is unknown; choose from {', '.join(NETWORKS)}")
-    return NETWORKS[specification.name]()
-
-
-def _paper() -> _Family:
-    from graspq.train.paper_network import PaperNetwork, PaperStateNetwork
-
-    return _Family(PaperNetwork, PaperStateNetwork)
-
-
-def _default() -> _Family:
-    from graspq.train.default_network import DefaultNetwork, DefaultStateNetwork
-
-    return _Family(DefaultNetwork, DefaultStateNetwork)
-
-
-NETWORKS: dict[str, Callable[[], _Family]] = {
-    "default": _default,
-    "paper": _paper,
-}
+    settings: type[NetworkSettings] = NetworkSettings

@@ -3,15 +3,36 @@
 It gives the same Q as the released graph but computes the image's part of the first fully connected layer once a state.
 """
 
+import dataclasses
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from graspq.common.errors import UserError
-from graspq.train.networks import Features, NetworkSpecification, QNetwork, StateNetwork
+from graspq.common.options import setting
+from graspq.train.networks.network import (
+    Features,
+    NetworkFamily,
+    NetworkSettings,
+    NetworkSpecification,
+    QNetwork,
+    StateNetwork,
+)
 
 INITIAL_DEVIATION = 0.01
 EPSILON = 1e-12
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperNetworkSettings(NetworkSettings):
+    """Options of the paper's network."""
+
+    width: int = setting(32, help="Channels and units.", minimum=1)
+
+
+def _units(specification: NetworkSpecification) -> int:
+    return PaperNetworkSettings.from_json(specification.settings).width
 
 
 class _LayerNorm(nn.Module):
@@ -48,7 +69,7 @@ class _StateMap(nn.Module):
             height, width = (height - 1) // 2, (width - 1) // 2
         if min(height, width) < 1:
             raise UserError(f"images of {specification.image_shape}: the paper's network needs at least 15 x 15 pixels")
-        units = specification.width
+        units = _units(specification)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(inputs, units, 3, stride=2, bias=False) for inputs in (channels, units, units)
         )
@@ -80,7 +101,7 @@ class PaperNetwork(QNetwork):
     def __init__(self, specification: NetworkSpecification) -> None:
         super().__init__()
         self.map = _StateMap(specification)
-        units = specification.width
+        units = _units(specification)
         self.action = nn.Linear(specification.actions, units + 1, bias=False)
         self.action_norm = _LayerNorm(units + 1, spatial=False)
         self.first = nn.Linear((units + 1) * self.map.pixels, units, bias=False)
@@ -114,7 +135,7 @@ class PaperStateNetwork(StateNetwork):
     def __init__(self, specification: NetworkSpecification, outputs: int) -> None:
         super().__init__()
         self.map = _StateMap(specification)
-        units = specification.width
+        units = _units(specification)
         self.first = nn.Linear((units + 1) * self.map.pixels, units, bias=False)
         self.first_norm = _LayerNorm(units, spatial=False)
         self.second = nn.Linear(units, units, bias=False)
@@ -136,3 +157,6 @@ def _initialise(network: nn.Module) -> None:
             nn.init.trunc_normal_(module.weight, std=INITIAL_DEVIATION, a=-bound, b=bound)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
+
+
+NETWORK = NetworkFamily(PaperNetwork, PaperStateNetwork, PaperNetworkSettings)

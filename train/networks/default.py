@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from graspq.common.errors import UserError
-from graspq.train.networks import Features, NetworkSpecification, QNetwork, StateNetwork
+from graspq.train.networks.network import Features, NetworkFamily, NetworkSpecification, QNetwork, StateNetwork
 
 CHANNELS = 64
 STATE = 256
@@ -195,3 +195,6 @@ def _float32(near: Tensor) -> torch.autocast:
 
 def _computing_type(device: str) -> torch.dtype:
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else torch.float32
+
+
+NETWORK = NetworkFamily(DefaultNetwork, DefaultStateNetwork)

@@ -1,0 +1,31 @@
+"""The table of estimators: a file each; a user's own is `--algo module:row`.
+
+Differs, for all rows with default options (`--preset paper` undoes it all):
+1. The loss is the cross-entropy of Q in [0, 1]. 2. Batches of 256, shifted and mirrored images, weight decay, a rate
+that falls to 0. 3. Policies use a moving average of the weights. 4. The network is `DefaultNetwork`.
+"""
+
+from typing import Any
+
+from graspq.common.named_objects import named_row
+from graspq.train.estimator import Estimator
+from graspq.train.estimators import blend, corr_mc, ddpg, dql, mc, pcl, supervised
+
+ESTIMATORS: dict[str, Estimator[Any]] = {
+    "supervised": supervised.ROW,
+    "dql": dql.ROW,
+    "mc": mc.ROW,
+    "corr-mc": corr_mc.ROW,
+    "ddpg": ddpg.ROW,
+    "pcl": pcl.ROW,
+    "blend": blend.ROW,
+}
+
+
+def estimator_named(name: str) -> Estimator[Any]:
+    """Return the row of `--algo`: one of the table's, or a user's own as `module:row`.
+
+    Raises:
+        UserError: there is none of that name, or what is there is no row.
+    """
+    return named_row("--algo", name, ESTIMATORS, Estimator, "row")

@@ -1,0 +1,48 @@
+"""`dql`: double Q-learning. Q(s, a) is regressed onto the reward and the discounted value of the best next action.
+
+Dimensions: B batch, T = 1 step, A action, N candidates.
+"""
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from graspq.common.options import setting
+from graspq.train.batch import Batch
+from graspq.train.estimator import Estimator, LaggedSettings, TargetValue
+from graspq.train.selection import StochasticSearch, uniform_actions, uniform_search
+from graspq.train.state import Networks
+from graspq.train.targets import bootstrapped
+
+
+@dataclasses.dataclass(frozen=True)
+class DqlSettings(LaggedSettings):
+    """Options of `dql`."""
+
+    candidates: int = setting(16, help="Uniform actions among which a target looks for the best.", minimum=1)
+
+
+def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torch.Generator, progress: float) -> Tensor:
+    """Return r + γ Q_θ'(s', a*), a* the best for Q_θ of N uniform actions; float [B, T]. See `targets.bootstrapped`.
+
+    One trunk pass of each network on s', whatever the number of candidates.
+
+    Source: Quillen et al. 2018, section "Off-Policy Q-Learning": 16 uniform candidates, a copy every 50 updates.
+    Differs: 1. The lagged network runs with the running statistics of batch normalisation that it was copied with; the
+    paper's network has none.
+    """
+    image, step = batch.next_states
+    drawn = uniform_actions(random, len(image), settings.candidates, batch.action.shape[-1]).to(image.device)
+    best = uniform_search(networks.q.at(image, step), drawn)
+    next_value = networks.lagged_q.at(image, step)(best.action.unsqueeze(1)).squeeze(1)
+    return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), settings.discount)
+
+
+ROW = Estimator(
+    summary="Double Q-learning: the reward and the discounted value of the best next action",
+    settings=DqlSettings,
+    target_value=TargetValue("bootstrapped (double Q, lagged target network)", target, needs_next=True),
+    action_selection=StochasticSearch(),
+    paper=DqlSettings(loss="squared"),
+)

@@ -1,0 +1,50 @@
+"""The common recipe of training: what every estimator is trained with unless told otherwise, and the paper's."""
+
+import dataclasses
+from typing import Literal
+
+from graspq.common.options import Settings, parse_count, setting
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe(Settings):
+    """Options that are the same for all estimators and that a preset decides; see each field's help."""
+
+    steps: int = setting(3_000, help="Gradient steps, such as 8000 or 8k.", minimum=1, parse=parse_count)
+    network: str = setting("default", help="Networks: default, paper, or module:network of your own.")
+    batch_size: int = setting(256, help="Transitions of a gradient step.", minimum=2)
+    learning_rate: float = setting(2e-3, help="Highest learning rate of AdamW.", minimum=0)
+    weight_decay: float = setting(0.02, help="Decoupled weight decay of matrices and filters; 0 is Adam.", minimum=0)
+    schedule: Literal["cosine", "constant"] = setting(
+        "cosine", help="Learning rate after warming up: cosine falls to 0 at the last step."
+    )
+    warmup: float = setting(
+        0.1, help="Part of the steps in which the learning rate rises linearly, 0 to 1.", minimum=0, maximum=1
+    )
+    average_decay: float = setting(
+        0.999,
+        help="Decay of the moving average of weights that policies use, below 1; 0 uses the weights themselves.",
+        minimum=0,
+        maximum=0.999999,
+    )
+    shift: int = setting(4, help="Largest random shift of images, pixels.", minimum=0, maximum=32)
+    mirror: bool = setting(True, help="Mirror half of each batch, where the data's action space has a mirror.")
+    precision: Literal["auto", "float32", "bfloat16"] = setting(
+        "auto", help="Arithmetic of the networks; auto: bfloat16 on hardware that has instructions for it."
+    )
+
+
+# Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
+PAPER = Recipe(
+    steps=2_000_000,
+    network="paper",
+    batch_size=32,
+    learning_rate=1e-3,
+    weight_decay=0.0,
+    schedule="constant",
+    warmup=0.0,
+    average_decay=0.0,
+    shift=0,
+    mirror=False,
+    precision="float32",
+)
