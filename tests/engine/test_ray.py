@@ -9,16 +9,21 @@ from ending import end_in_the_middle
 from units_of_work import ReadsFolder, Squares
 
 from graspq.common.errors import UserError
+from graspq.datagen.collect import Block, Collection, collected
+from graspq.datagen.settings import CollectionSettings
 from graspq.engine import EngineSettings, run
+from graspq.sim.task import TASKS
 
 pytest.importorskip("ray")
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def cluster(tmp_path_factory):
     """Two nodes of one core each, the first of which is the caller's."""
     from ray.cluster_utils import Cluster
 
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
     logging.disable(logging.WARNING)
     patient = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": patient})
@@ -26,6 +31,7 @@ def cluster():
     yield made
     made.shutdown()
     logging.disable(logging.NOTSET)
+    monkeypatch.undo()
 
 
 @pytest.fixture
@@ -52,7 +58,7 @@ def test_mistakes_and_defects_are_those_of_the_local_engine(on_cluster):
         list(run(Squares(), ["defect"], on_cluster, name=lambda unit: f"unit {unit}"))
 
 
-def test_a_node_elsewhere_reads_its_own_copy_of_a_folder(on_cluster, tmp_path, monkeypatch):
+def test_a_node_elsewhere_reads_its_own_copy_of_a_folder(on_cluster, tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "a").write_text(f"content {time.time()}")
@@ -62,13 +68,28 @@ def test_a_node_elsewhere_reads_its_own_copy_of_a_folder(on_cluster, tmp_path, m
     assert str(folder) in places and len(places) == 2
 
 
-def test_units_of_a_node_that_is_killed_are_done_on_those_that_remain(cluster, on_cluster):
-    results, units = [], [("sleep", 0.1 * number) for number in range(10)]
-    for unit, _ in run(Squares(), units, on_cluster):
-        results.append(unit)
-        if len(results) == 3:
+def test_a_collection_whose_node_is_killed_in_the_middle_gives_the_bytes_of_the_local_engine(
+    cluster, on_cluster, regular_objects
+):
+    settings = CollectionSettings(block_size=2)
+    work = Collection(TASKS["regular"].settings.to_json(), regular_objects.folder, settings)
+    blocks = [Block(number, 2, 2 * number) for number in range(10)]
+    found = {}
+    for block, episodes in collected(work, blocks, on_cluster):
+        found[block] = episodes
+        if len(found) == 3:
             cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
-    assert sorted(results) == units
+    expected = dict(collected(work, blocks, EngineSettings(workers=0)))
+    assert {block: contents(episodes) for block, episodes in found.items()} == {
+        block: contents(episodes) for block, episodes in expected.items()
+    }
+
+
+def contents(episodes):
+    return [
+        {name: value.tobytes() if hasattr(value, "tobytes") else value for name, value in vars(episode).items()}
+        for episode in episodes
+    ]
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://nowhere", "nonsense"])
