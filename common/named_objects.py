@@ -45,7 +45,9 @@ def named_object(name: str, what: str) -> Any:
     try:
         module = named_module(module_name)
     except Exception as error:
-        raise UserError(f"{what} {name}: cannot be imported, {described(error)}") from error
+        raise UserError(
+            f"{what} {name}: cannot be imported, {described(error)}; run it where {module_name} is"
+        ) from error
     if not hasattr(module, attribute):
         raise UserError(f"{what} {name}: {module_name} has no {attribute!r}")
     return getattr(module, attribute)
@@ -82,6 +84,6 @@ def source_digest(name: str) -> str | None:
 
 def described(error: Exception) -> str:
     """Return an error with the place it was raised at, in one line."""
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
     where = f" at {os.path.relpath(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
     return " ".join(f"{type(error).__name__}: {error}{where}".split())

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from graspq.common.machine import one_thread
 from graspq.common.seeding import generator, integer_seed
 from graspq.datagen.settings import CollectionSettings
 from graspq.datasets.episode import Episode
@@ -50,13 +51,13 @@ class Collection:
         task: settings of the task, as in a manifest.
         objects: folder of the object set.
         settings: what determines the episodes.
-        make_policy: makes who acts, in each worker; the random policy of the settings where it is None.
+        policy: who acts, pickled to each worker; the random policy of the settings where it is None.
     """
 
     task: dict[str, Any]
     objects: Path
     settings: CollectionSettings
-    make_policy: Callable[[], Policy] | None = None
+    policy: Policy | None = None
 
     def folders(self) -> Sequence[Path]:
         """Return the object set's folder."""
@@ -65,10 +66,10 @@ class Collection:
     @contextlib.contextmanager
     def open(self, place: Place) -> Iterator[Callable[[Block], list[Episode]]]:
         """Hold one simulation."""
-        policy = self.make_policy() if self.make_policy is not None else None
-        with GraspSimulation(task_from_json(self.task), ObjectSet.load(place(self.objects))) as simulation:
+        task, objects = task_from_json(self.task), ObjectSet.load(place(self.objects))
+        with one_thread(), GraspSimulation(task, objects) as simulation:
             yield lambda block: collect_block(
-                simulation, self.settings, block.number, block.episodes, policy, block.first_episode
+                simulation, self.settings, block.number, block.episodes, self.policy, block.first_episode
             )
 
 

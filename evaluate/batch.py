@@ -3,14 +3,11 @@
 A job that fails leaves the others alone; what is finished already is not run again.
 """
 
-import csv
-import io
-import json
 import sys
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,8 @@ import click
 from tqdm import tqdm
 
 from graspq.common.errors import UserError
-from graspq.common.files import writable_folder, write_text
+from graspq.common.files import writable_folder
+from graspq.common.text import aligned, write_csv, write_jsonl
 from graspq.evaluate.evaluation import Prepared, prepare, run_prepared
 from graspq.evaluate.jobs import Job
 from graspq.evaluate.records import EpisodeRow, Evaluation
@@ -32,31 +30,43 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A job in the plan: ready (with or without a finished evaluation), or refused with the reason."""
+class Planned:
+    """A job of a plan.
+
+    Attributes:
+        job: the job.
+        prepared: what it needs; None where that is not there.
+        evaluation: the finished evaluation, if it is there.
+        error: why it cannot be run, or why it failed.
+    """
 
     job: Job
-    prepared: Prepared | None
-    error: str | None
+    prepared: Prepared | None = None
+    evaluation: Evaluation | None = None
+    error: str | None = None
 
     @property
     def status(self) -> str:
         """Return what will be done about it, in a word or a line."""
         if self.prepared is None:
             return f"cannot run: {self.error}"
-        return "finished" if self.prepared.finished is not None else "to do"
+        return "finished" if self.evaluation is not None else "to do"
 
+    @property
+    def line(self) -> str:
+        """Return its result in one line."""
+        if self.evaluation is None:
+            return f"{self.job.label}: failed: {self.error}"
+        summary = self.evaluation.summary
+        low, high = summary["ci95"]
+        return (
+            f"{self.job.label}: {100 * summary['success_rate']:.1f} % of {summary['episodes']} grasps succeeded "
+            f"(95 %: {100 * low:.1f} to {100 * high:.1f}), {summary['task']} {summary['split']}, "
+            f"{self.evaluation.folder.as_posix()}"
+        )
 
-@dataclass(frozen=True)
-class Result:
-    """What became of a job."""
-
-    job: Job
-    evaluation: Evaluation | None
-    error: str | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the row of the results table."""
+    def row(self) -> dict[str, Any]:
+        """Return its row of the table of results."""
         row: dict[str, Any] = dict.fromkeys(COLUMNS)
         row |= {
             "label": self.job.label,
@@ -78,113 +88,90 @@ class Result:
         return row
 
 
-def make_plan(jobs: Sequence[Job], settings: EvalSettings) -> list[Entry]:
+def make_plan(jobs: Sequence[Job], settings: EvalSettings) -> list[Planned]:
     """Find what each job needs; jobs without a run take their scenes from those with one.
 
     Raises:
         UserError: the only job cannot be run.
     """
-    entries: dict[Job, Entry] = {}
+    plan: dict[Job, Planned] = {}
     for job in sorted(jobs, key=lambda job: job.run is None):
-        beside = [entry.prepared for entry in entries.values() if entry.prepared is not None]
+        beside = [other.prepared for other in plan.values() if other.prepared is not None]
         try:
-            entries[job] = Entry(job, prepare(job, settings, beside), None)
+            prepared = prepare(job, settings, beside)
+            plan[job] = Planned(job, prepared, prepared.finished)
         except UserError as error:
             if len(jobs) == 1:
                 raise
-            entries[job] = Entry(job, None, error.message)
-    return [entries[job] for job in jobs]
+            plan[job] = Planned(job, error=error.message)
+    return [plan[job] for job in jobs]
 
 
-def plan_table(entries: Sequence[Entry]) -> str:
+def plan_table(plan: Sequence[Planned]) -> str:
     """Return the plan for the terminal: a line for each job."""
     rows = [("policy", "task", "split", "seed", "episodes", "object set", "")]
-    for entry in entries:
-        job, prepared = entry.job, entry.prepared
+    for planned in plan:
+        job, prepared = planned.job, planned.prepared
         task = prepared.task.settings.name if prepared is not None else job.task or "?"
         objects = prepared.objects.folder.as_posix() if prepared is not None else str(job.objects or "?")
-        rows.append((job.label, task, job.split, str(job.seed), str(job.episodes), objects, entry.status))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True)).rstrip() for row in rows
-    ]
-    return "\n".join(lines)
+        rows.append((job.label, task, job.split, str(job.seed), str(job.episodes), objects, planned.status))
+    return aligned(rows)
 
 
-def run_plan(entries: Sequence[Entry], settings: EvalSettings, table: Path | None) -> list[Result]:
-    """Run what is to do, in order; the table of results is rewritten after every job.
+def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None) -> list[Planned]:
+    """Run what is to do, in order, and return the plan with its results.
 
     Args:
-        entries: the plan.
+        plan: the jobs.
         settings: of the command.
-        table: folder of `results.jsonl` and `results.csv`; None for none.
+        table: folder of `results.jsonl` and `results.csv`, rewritten after every job; None for none.
 
     Raises:
-        UserError, RolloutError: the only job fails.
+        UserError: the only job fails.
     """
-    results: list[Result] = []
-    for number, entry in enumerate(entries, start=1):
-        if entry.prepared is None:
-            results.append(Result(entry.job, None, entry.error))
-        elif entry.prepared.finished is not None and not settings.again:
-            results.append(Result(entry.job, entry.prepared.finished, None))
+    results: list[Planned] = []
+    for number, planned in enumerate(plan, start=1):
+        if planned.prepared is None or (planned.evaluation is not None and not settings.again):
+            results.append(planned)
         else:
-            place = f"[{number}/{len(entries)}] " if len(entries) > 1 else ""
-            results.append(_run_one(entry.prepared, settings, place, alone=len(entries) == 1))
-        click.echo(_line(results[-1]), err=results[-1].evaluation is None)
+            place = f"[{number}/{len(plan)}] " if len(plan) > 1 else ""
+            results.append(_run(planned, planned.prepared, settings, place, alone=len(plan) == 1))
+        click.echo(results[-1].line, err=results[-1].evaluation is None)
         if table is not None:
             write_table(table, results)
     return results
 
 
-def _run_one(prepared: Prepared, settings: EvalSettings, place: str, *, alone: bool) -> Result:
+def _run(planned: Planned, prepared: Prepared, settings: EvalSettings, place: str, *, alone: bool) -> Planned:
     started = time.monotonic()
+    episodes = prepared.job.episodes
     try:
-        with Progress(f"{place}{prepared.job.label}", prepared.job.episodes) as progress:
+        with Progress(f"{place}{prepared.job.label}", episodes) as progress:
             evaluation = run_prepared(prepared, settings, progress.add)
-    except click.ClickException as error:
+    except UserError as error:
         if alone:
             raise
-        return Result(prepared.job, None, error.message)
+        return replace(planned, evaluation=None, error=error.message)
     except Exception as error:  # a defect: the others go on, and its traceback is shown
         if alone:
             raise
         traceback.print_exc()
-        return Result(prepared.job, None, f"{type(error).__name__}: {error}")
+        return replace(planned, evaluation=None, error=f"{type(error).__name__}: {error}")
     seconds = time.monotonic() - started
-    click.echo(
-        f"{prepared.job.episodes} episodes in {seconds:.0f} s, {prepared.job.episodes / seconds:.1f} a second", err=True
-    )
-    return Result(prepared.job, evaluation, None)
+    click.echo(f"{episodes} episodes in {seconds:.0f} s, {episodes / seconds:.1f} a second", err=True)
+    return replace(planned, evaluation=evaluation)
 
 
-def _line(result: Result) -> str:
-    """Return a result in one line."""
-    if result.evaluation is None:
-        return f"{result.job.label}: failed: {result.error}"
-    summary = result.evaluation.summary
-    low, high = summary["ci95"]
-    return (
-        f"{result.job.label}: {100 * summary['success_rate']:.1f} % of {summary['episodes']} grasps succeeded "
-        f"(95 %: {100 * low:.1f} to {100 * high:.1f}), {summary['task']} {summary['split']}, "
-        f"{result.evaluation.folder.as_posix()}"
-    )
-
-
-def write_table(folder: Path, results: Sequence[Result]) -> None:
+def write_table(folder: Path, results: Sequence[Planned]) -> None:
     """Write `results.jsonl` and `results.csv`, a row for each job, atomically.
 
     Raises:
         UserError: the folder cannot be written.
     """
     writable_folder(folder, "results table")
-    rows = [result.to_json() for result in results]
-    write_text(folder / "results.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(folder / "results.csv", text.getvalue())
+    rows = [result.row() for result in results]
+    write_jsonl(folder / "results.jsonl", rows)
+    write_csv(folder / "results.csv", COLUMNS, rows)
 
 
 class Progress:

@@ -1,15 +1,19 @@
 """`grasp-eval`: score runs, the random policy, the oracle and users' policies on scenes that no training has seen.
 
-The way on: `jobs` (what to do) -> `batch` (one after the other) -> `evaluation` -> `rollout` and `policies`.
+The way on: `jobs` (what to do) -> `batch` (one after the other) -> `evaluation` -> `rollout`, played by `sim/play`.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from graspq.common.errors import UserError
 from graspq.common.options import Command, options_from, with_version
 from graspq.evaluate.settings import EvalSettings
+
+if TYPE_CHECKING:
+    from graspq.evaluate.evaluation import Prepared
 
 RESULTS = Path("runs/evaluations")
 
@@ -47,18 +51,18 @@ def evaluate(settings: EvalSettings) -> int:
     jobs = jobs_from_settings(settings)
     several = len(jobs) > 1
     if settings.video is not None:
-        _check_video(settings, several)
-    entries = make_plan(jobs, settings)
+        _check_video(settings.video, several)
+    plan = make_plan(jobs, settings)
     if several or settings.plan:
-        click.echo(plan_table(entries))
+        click.echo(plan_table(plan))
     if settings.plan:
-        return int(any(entry.prepared is None for entry in entries))
+        return int(any(planned.prepared is None for planned in plan))
     table = settings.out if settings.out is not None else _results_folder(settings) if several else None
-    results = run_plan(entries, settings, table)
+    results = run_plan(plan, settings, table)
     if table is not None:
         click.echo(f"results: {(table / 'results.csv').as_posix()}")
-    if settings.video is not None and entries[0].prepared is not None:
-        _write_video(settings, entries[0].prepared)
+    if settings.video is not None and results[0].prepared is not None:
+        _write_video(settings, settings.video, results[0].prepared)
     return int(any(result.evaluation is None for result in results))
 
 
@@ -66,26 +70,17 @@ def _results_folder(settings: EvalSettings) -> Path:
     return RESULTS / settings.jobs.stem if settings.jobs is not None else RESULTS
 
 
-def _check_video(settings: EvalSettings, several: bool) -> None:
+def _check_video(path: Path, several: bool) -> None:
     from graspq.evaluate.video import check_video_path
 
-    assert settings.video is not None
     if several:
         raise UserError("--video: one job makes one video; name one run or one policy")
-    check_video_path(settings.video)
+    check_video_path(path)
 
 
-def _write_video(settings: EvalSettings, prepared: "object") -> None:
-    from graspq.evaluate.evaluation import Prepared, stage_of
+def _write_video(settings: EvalSettings, path: Path, prepared: "Prepared") -> None:
     from graspq.evaluate.video import write_video
 
-    assert isinstance(prepared, Prepared) and settings.video is not None
-    successes = write_video(
-        settings.video,
-        stage_of(prepared),
-        prepared.policy,
-        episodes=min(settings.video_episodes, prepared.job.episodes),
-        environments=prepared.job.environments,
-        size=settings.video_size,
-    )
-    click.echo(f"video: {settings.video} ({sum(successes)} of {len(successes)} grasps succeed in it)")
+    episodes = min(settings.video_episodes, prepared.job.episodes)
+    successes = write_video(path, prepared.rollouts, episodes=episodes, size=settings.video_size)
+    click.echo(f"video: {path} ({sum(successes)} of {len(successes)} grasps succeed in it)")

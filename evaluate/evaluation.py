@@ -6,7 +6,7 @@ The scenes follow from the job; `eval.json` holds no times and no hosts, so the 
 import contextlib
 import json
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +15,14 @@ import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
+from graspq.common.named_objects import source_digest
 from graspq.common.options import flag
 from graspq.common.provenance import code_revision, versions
-from graspq.evaluate.films import FilmKeeper, write_films
+from graspq.evaluate.films import write_films
 from graspq.evaluate.jobs import Job
-from graspq.evaluate.object_sets import find_object_set
-from graspq.evaluate.policies import ACTOR, CEM, ORACLE, RANDOM, Policy, RandomObservationPolicy, UserPolicy
 from graspq.evaluate.records import (
+    ACTOR,
+    CEM,
     EPISODES_FILE,
     FORMAT_VERSION,
     EpisodeRow,
@@ -30,13 +31,17 @@ from graspq.evaluate.records import (
     write_rows,
     write_summary,
 )
-from graspq.evaluate.settings import GROUP, CemSettings, EvalSettings
+from graspq.evaluate.rollout import Rollouts, run_rollouts
+from graspq.evaluate.scenes import Scenes, datasets_of, find_object_set, object_set_of
+from graspq.evaluate.settings import EvalSettings
 from graspq.evaluate.statistics import wilson_interval
+from graspq.objects.object_set import ObjectSet
+from graspq.policies.named import ScoredPolicy, policy_named
+from graspq.sim.task import Task, task_from_json, task_named
+from graspq.train.selection import CemSettings
 
 if TYPE_CHECKING:
-    from graspq.evaluate.runs import RunFacts
-    from graspq.objects.object_set import ObjectSet
-    from graspq.sim.task import Task
+    from graspq.policies.of_run import RunPolicy
 
 BASELINES = Path("runs/baselines")
 PACKAGES = ("numpy", "pybullet", "torch")
@@ -48,23 +53,33 @@ class Prepared:
 
     Attributes:
         job: the job.
-        task: settings of its task.
+        scenes: what its episodes begin with.
         objects: its object set, verified.
-        facts: what the run's folder says; None without a run.
-        policy: who decides; None for the oracle.
+        policy: who acts.
+        run: the same, where it is a run's.
         identity: all that determines the result; the same identity is the same job.
         folder: where its files are or will be.
         finished: the evaluation, if it is there already.
     """
 
     job: Job
-    task: "Task"
-    objects: "ObjectSet"
-    facts: "RunFacts | None"
-    policy: Policy | None
+    scenes: Scenes
+    objects: ObjectSet
+    policy: ScoredPolicy
+    run: "RunPolicy | None"
     identity: dict[str, Any]
     folder: Path
     finished: Evaluation | None
+
+    @property
+    def task(self) -> Task:
+        """The task."""
+        return self.scenes.task
+
+    @property
+    def rollouts(self) -> Rollouts:
+        """What the workers do."""
+        return Rollouts(self.scenes, self.policy)
 
 
 def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -> Prepared:
@@ -80,25 +95,26 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
         UserError: PyBullet, the run, its checkpoint, the task, the object set, its split or the policy is not there.
     """
     _check_simulator()
-    policy, facts = _policy(job, settings)
-    task, objects = _scenes(job, facts, beside)
-    _check_fit(job, facts, task)
+    run = _run_policy(job, settings)
+    policy: ScoredPolicy = run if run is not None else policy_named(str(job.policy))
+    task, objects = _task_and_objects(job, run, beside)
+    if run is not None:
+        _check_fit(job, run, task)
     task.draw(objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
     identity = {
         "simulator": versions("pybullet", "numpy"),
         "task": task.settings.to_json(),
+        "task_source": source_digest(task.settings.name) if ":" in task.settings.name else None,
         "split": job.split,
         "seed": job.seed,
         "episodes": job.episodes,
-        "environments": job.environments,
-        "rows_of_a_batch": GROUP,  # they round together
         "object_set": objects.digest(),
         "policy": job.policy,
-        "network": facts.network_sha256 if facts is not None else None,
-        **(policy.identity() if policy is not None else {}),
+        **policy.identity(),
     }
     folder, finished = _place(job, task.settings.name, settings.out, identity)
-    return Prepared(job, task, objects, facts, policy, identity, folder, finished)
+    scenes = Scenes(task, objects.folder, job.split, job.seed)
+    return Prepared(job, scenes, objects, policy, run, identity, folder, finished)
 
 
 def _check_simulator() -> None:
@@ -108,56 +124,50 @@ def _check_simulator() -> None:
         raise UserError("evaluation needs the simulator, and PyBullet is not installed; run: pip install 'graspq[sim]'")
 
 
-def _policy(job: Job, settings: EvalSettings) -> "tuple[Policy | None, RunFacts | None]":
-    if job.run is not None:
-        from graspq.evaluate.runs import load_run
+def _run_policy(job: Job, settings: EvalSettings) -> "RunPolicy | None":
+    if job.run is None:
+        return None
+    # Imported late: the other policies need no PyTorch.
+    from graspq.policies.of_run import load
 
-        return load_run(job.run, job.checkpoint, job.cem, settings.device)
-    assert job.policy is not None
-    if job.policy == ORACLE:
-        return None, None
-    return RandomObservationPolicy() if job.policy == RANDOM else UserPolicy.load(job.policy), None
+    return load(job.run, job.checkpoint, cem=job.cem, device=settings.device)
 
 
-def _scenes(job: Job, facts: "RunFacts | None", beside: Sequence[Prepared]) -> "tuple[Task, ObjectSet]":
-    """Return the task and the object set that a job's scenes are made of."""
-    from graspq.sim.task import task_from_json, task_named
-
-    name = job.task or (str(facts.task["name"]) if facts is not None else _common_task(beside))
-    if facts is not None and facts.task["name"] == name:
-        task = task_from_json(facts.task)
-        return task, find_object_set(task, job.objects, facts.object_set, facts.datasets)
-    same = [other for other in beside if other.facts is not None and other.task.settings.name == name]
-    task = same[0].task if same and facts is None else task_named(name)
+def _task_and_objects(job: Job, run: "RunPolicy | None", beside: Sequence[Prepared]) -> tuple[Task, ObjectSet]:
+    """Return what a job's scenes are made of."""
+    name = job.task or (str(run.origin.task["name"]) if run is not None else _common_task(beside))
+    if run is not None and run.origin.task["name"] == name:
+        task, config = task_from_json(run.origin.task), run.origin.config
+        return task, find_object_set(task, job.objects, object_set_of(config), datasets_of(config))
+    same = [other for other in beside if other.run is not None and other.task.settings.name == name]
+    task = same[0].task if same and run is None else task_named(name)
     return task, find_object_set(task, job.objects, None, (), [other.objects.folder for other in same])
 
 
 def _common_task(beside: Sequence[Prepared]) -> str:
     """Return the task that the runs of a plan have in common; `regular` where there are none or several."""
-    names = {other.task.settings.name for other in beside if other.facts is not None}
+    names = {other.task.settings.name for other in beside if other.run is not None}
     return names.pop() if len(names) == 1 else "regular"
 
 
-def _check_fit(job: Job, facts: "RunFacts | None", task: "Task") -> None:
+def _check_fit(job: Job, run: "RunPolicy", task: Task) -> None:
     """Refuse a network that was trained on other images or actions than the task's."""
-    if facts is None:
-        return
-    shape = (task.settings.image_size, task.settings.image_size, 3)
+    specification, size = run.origin.specification, task.settings.image_size
     pairs = (
-        ("images", facts.image_shape, shape),
-        ("action limits", facts.action_limits, task.action.limits),
-        ("steps", facts.steps, task.settings.max_steps),
+        ("images", tuple(specification.image_shape), (size, size, 3)),
+        ("action limits", run.acting.action.limits, task.action.limits),
+        ("steps", specification.steps, task.settings.max_steps),
     )
-    for what, run, here in pairs:
-        if run != here:
+    for what, there, here in pairs:
+        if there != here:
             raise UserError(
-                f"{job.run}: trained with {what} {run}, the {task.settings.name} task has {here}; name its own --task"
+                f"{job.run}: trained with {what} {there}, the {task.settings.name} task has {here}; name its own --task"
             )
 
 
 def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any]) -> tuple[Path, Evaluation | None]:
     """Return the job's folder, and its evaluation if it is finished; another job's evaluation is never overwritten."""
-    name = f"{task}-{job.split}-seed{job.seed}-{job.episodes}"
+    name = f"{task}-{job.split}-seed{job.seed}-{job.episodes}".replace(":", ".")
     if out is not None or job.run is None:
         parent, name = out if out is not None else BASELINES, f"{job.label.replace(':', '.')}-{name}"
     else:
@@ -184,68 +194,24 @@ def run_prepared(
     """Run a prepared job and write its files.
 
     Raises:
-        UserError: the folder cannot be written, or a user's policy fails.
-        RolloutError: an episode ends its simulator each time.
+        UserError: the folder cannot be written, a user's policy fails, or episodes end their simulators each time.
     """
     folder = writable_folder(prepared.folder, "evaluation")
     try:
-        rows, films = play(prepared, settings, on_row)
+        rows, films = run_rollouts(
+            prepared.rollouts, prepared.job.episodes, settings.where, films=settings.films, on_row=on_row
+        )
     except BaseException:
         with contextlib.suppress(OSError):
             folder.rmdir()  # only if it is empty: nothing of an unfinished evaluation stays
         raise
     write_rows(folder, rows)
-    write_films(folder, films.chosen())
+    write_films(folder, films)
     return write_summary(folder, _summary(prepared, rows))
 
 
-def play(
-    prepared: Prepared, settings: EvalSettings, on_row: Callable[[EpisodeRow], None] | None = None
-) -> tuple[Sequence[EpisodeRow], FilmKeeper]:
-    """Run the episodes of a prepared job; return their rows in order, and the films. See `rollout.run_episodes`."""
-    from graspq.evaluate.rollout import run_episodes
-
-    with _one_thread() if prepared.facts is not None else contextlib.nullcontext():
-        return run_episodes(
-            stage_of(prepared),
-            prepared.policy,
-            episodes=prepared.job.episodes,
-            environments=prepared.job.environments,
-            workers=settings.workers,
-            films=settings.films,
-            on_row=on_row,
-        )
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let PyTorch compute in one thread.
-
-    The simulators keep the cores busy, so threads of one decision would wait for each other: with two on two cores an
-    evaluation was a third slower. And rounding does not depend on the number of cores.
-    """
-    import torch
-
-    usual = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(usual)
-
-
-def stage_of(prepared: Prepared) -> Any:
-    """Return what the workers need to know of a job."""
-    from graspq.evaluate.workers import Stage
-
-    job = prepared.job
-    return Stage(
-        prepared.task.settings.to_json(), str(prepared.objects.folder), job.split, job.seed, job.policy == ORACLE
-    )
-
-
 def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
-    job, facts = prepared.job, prepared.facts
+    job, run = prepared.job, prepared.run
     search = prepared.identity.get("cem")
     successes = sum(row.success for row in rows)
     return {
@@ -262,8 +228,8 @@ def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "ends": {end: sum(row.end == end for row in rows) for end in ("height", "T")},
         "policy": job.policy or (CEM if search is not None else ACTOR),
         "run": job.run.as_posix() if job.run is not None else None,
-        "algo": facts.algo if facts is not None else None,
-        "checkpoint_step": facts.step if facts is not None else None,
+        "algo": run.origin.algo if run is not None else None,
+        "checkpoint_step": run.origin.step if run is not None else None,
         "seed": job.seed,
         "object_set": {"name": prepared.objects.name, "sha256": prepared.objects.digest()},
         "cem": search,
@@ -281,7 +247,6 @@ def command_of(job: Job) -> str:
     words += ["--split", job.split, "--episodes", str(job.episodes), "--seed", str(job.seed)]
     words += ["--objects", job.objects.as_posix()] if job.objects is not None else []
     words += ["--checkpoint", str(job.checkpoint)] if job.checkpoint is not None else []
-    words += ["--environments", str(job.environments)] if job.environments != EvalSettings.environments else []
     usual = CemSettings()
     for name, value in job.cem.to_json().items():
         if value != getattr(usual, name):

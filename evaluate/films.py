@@ -36,13 +36,13 @@ class FilmKeeper:
         self.count = count
         self._kept: dict[bool, dict[int, Film]] = {True: {}, False: {}}
 
-    def offer(self, row: EpisodeRow, frames: Sequence[np.ndarray]) -> None:
-        """Consider an episode that has ended; frames are uint8 [H, W, 3]."""
+    def offer(self, film: Film) -> None:
+        """Consider an episode that has ended."""
         if self.count == 0:
             return
-        kept = self._kept[row.success]
-        if len(kept) < self.count or row.episode < max(kept):
-            kept[row.episode] = Film(row, np.stack(frames))
+        kept, index = self._kept[film.row.success], film.row.episode
+        if len(kept) < self.count or index < max(kept):
+            kept[index] = film
             if len(kept) > self.count:
                 del kept[max(kept)]
 

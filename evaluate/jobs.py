@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
-from graspq.evaluate.policies import ORACLE, RANDOM
-from graspq.evaluate.settings import CemSettings, EvalSettings
+from graspq.evaluate.records import ORACLE, RANDOM
+from graspq.evaluate.settings import EvalSettings
+from graspq.train.selection import CemSettings
 
 LISTS = ("runs", "policies", "tasks", "splits", "objects", "seeds")
 SINGLES = ("episodes", "checkpoint", "cem")
@@ -34,7 +35,6 @@ class Job:
         objects: folder of the object set; None to find the run's own.
         checkpoint: training step; None for the last.
         cem: settings of the search.
-        environments: rows of a batch.
     """
 
     run: Path | None
@@ -46,7 +46,6 @@ class Job:
     objects: Path | None = None
     checkpoint: int | None = None
     cem: CemSettings = field(default_factory=CemSettings)
-    environments: int = 32
 
     @property
     def label(self) -> str:
@@ -145,7 +144,6 @@ def _product(
             objects=folder,
             checkpoint=table.get("checkpoint", settings.checkpoint) if run is not None else None,
             cem=cem,
-            environments=settings.environments,
         )
         for task, split, folder, seed, (run, policy) in combinations
     ]

@@ -18,7 +18,8 @@ EVAL_FILE = "eval.json"
 EPISODES_FILE = "episodes.jsonl"
 FILMS_FILE = "films.npz"
 FORMAT_VERSION = 1
-ORACLE, RANDOM = "oracle", "random"  # the two ends of the scale, as eval.json calls them
+# What eval.json calls policies: the two ends of the scale, and those of runs.
+ORACLE, RANDOM, CEM, ACTOR = "oracle", "random", "cem", "actor"
 
 
 @dataclass(frozen=True)

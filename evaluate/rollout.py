@@ -1,237 +1,107 @@
-"""Rollouts in groups: environments in worker processes, one batched decision in the parent for each group of them.
+"""Rollouts: a few episodes at a time, each a function of (policy, scenes, index), wherever the engine has workers.
 
-The environments of a group act in lockstep; while the parent decides for one group, the workers simulate the others.
-Episode i runs in slot i mod `environments`, its scene and its noise are functions of (seed, i), a group is a fixed set
-of slots, and every decision is made on a group's whole batch with that slot's row: so no result depends on the number
-of workers or on what else runs.
+A worker holds one simulation and the policy, and decides for one state at a time in one thread: no result depends on
+the number of workers or on what else they play.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from multiprocessing.connection import wait
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import click
-import numpy as np
-
-from graspq.common.errors import UserError
-from graspq.common.machine import available_cores
+from graspq.common.machine import one_thread
 from graspq.common.seeding import generator
-from graspq.evaluate.films import FilmKeeper
-from graspq.evaluate.policies import Policy
+from graspq.engine import EngineSettings, Place, run
+from graspq.evaluate.films import Film, FilmKeeper
 from graspq.evaluate.records import EpisodeRow
-from graspq.evaluate.settings import GROUP
-from graspq.evaluate.workers import Begun, Command, Ended, Idle, Refused, Seen, Stage, start
+from graspq.evaluate.scenes import Scenes
+from graspq.objects.object_set import ObjectSet
+from graspq.sim.play import Played, Policy, play
 
-POLICY_PURPOSE = "evaluate/policy"
-ATTEMPTS = 2
-
-
-class RolloutError(click.ClickException):
-    """An episode that ends its simulator process each time it runs: a defect, reported in one line."""
+EPISODES_PER_UNIT = 2
+UNITS_PER_WORKER = 1000  # the simulator leaks shapes: workers are renewed
+_PURPOSE = "evaluate/policy"
 
 
-@dataclass
-class _Slot:
-    """An environment: the episodes that remain for it, and the state of the one that runs."""
+@dataclass(frozen=True)
+class Rollouts:
+    """What the workers of an evaluation do: a unit is a range of episodes.
 
-    episodes: list[int]
-    episode: int | None = None
-    object_ids: tuple[str, ...] = ()
-    rng: np.random.Generator | None = None
-    image: np.ndarray | None = None
-    step: int = 0
-    pose: np.ndarray = field(default_factory=lambda: np.zeros(4, dtype=np.float32))
-    q: float | None = None
-    frames: list[np.ndarray] = field(default_factory=list)
+    Attributes:
+        scenes: of the evaluation.
+        policy: who acts.
+    """
 
+    scenes: Scenes
+    policy: Policy
 
-@dataclass
-class _Crew:
-    """A worker process, its pipe, the slots it serves, and the commands it has not answered yet, in order."""
+    def folders(self) -> Sequence[Path]:
+        """Return the object set's folder."""
+        return [self.scenes.objects]
 
-    process: Any
-    connection: Any
-    slots: list[int]
-    pending: list[Command] = field(default_factory=list)
+    @contextlib.contextmanager
+    def open(self, place: Place) -> Iterator[Callable[[range], list[Film]]]:
+        """Yield what plays the episodes of a unit."""
+        # Imported here: the parent needs no simulator.
+        from graspq.sim.episode import GraspSimulation
 
+        objects = ObjectSet.load(place(self.scenes.objects))
+        with one_thread(), GraspSimulation(self.scenes.task, objects) as simulation:
+            yield lambda episodes: [self._filmed(simulation, episode) for episode in episodes]
 
-class Rollout:
-    """Runs the episodes of one evaluation; use `run`."""
-
-    def __init__(
-        self,
-        stage: Stage,
-        policy: Policy | None,
-        *,
-        episodes: int,
-        environments: int,
-        workers: int | None = None,
-        films: int = 0,
-        on_row: Callable[[EpisodeRow], None] | None = None,
-    ) -> None:
-        """Prepare.
-
-        Args:
-            stage: what determines the scenes.
-            policy: decides in the parent; None when the oracle acts in the workers (`stage.oracle`).
-            episodes: number of episodes, at least 1; episode i is the same in a longer evaluation.
-            environments: number of slots; `GROUP` of them are the rows of a batch.
-            workers: processes; all cores by default.
-            films: number of episodes whose frames are kept.
-            on_row: called for each finished episode, in no fixed order.
-        """
-        self.stage, self.policy, self.episodes = stage, policy, episodes
-        self.slots = [_Slot(list(range(slot, episodes, environments))) for slot in range(environments)]
-        numbers = range(environments)
-        self._groups = [numbers[first : first + GROUP] for first in numbers[::GROUP]]
-        busy = min(environments, episodes)
-        self.worker_count = max(1, min(workers or available_cores(), busy))
-        self.films = FilmKeeper(films)
-        self.on_row = on_row
-        self.rows: dict[int, EpisodeRow] = {}
-        self._crews: list[_Crew] = []
-        self._deaths: dict[int, int] = {}
-
-    def run(self) -> list[EpisodeRow]:
-        """Run all episodes and return their rows in order.
-
-        Raises:
-            UserError: the object set or a user's policy is at fault.
-            RolloutError: an episode ended its simulator process twice.
-        """
-        busy = range(min(len(self.slots), self.episodes))
-        try:
-            for number in range(self.worker_count):
-                process, connection = start(self.stage)
-                self._crews.append(_Crew(process, connection, list(busy[number :: self.worker_count])))
-            for crew in self._crews:
-                self._send(crew, [self._begin(slot) for slot in crew.slots])
-            self._loop()
-        finally:
-            self._stop()
-        return [self.rows[episode] for episode in range(self.episodes)]
-
-    def _loop(self) -> None:
-        while any(crew.pending for crew in self._crews):
-            self._listen()
-            unanswered = {command.slot for crew in self._crews for command in crew.pending}
-            for group in self._groups:
-                waiting = [slot for slot in group if self.slots[slot].image is not None]
-                if waiting and unanswered.isdisjoint(group):
-                    self._answer(group, waiting)
-
-    def _answer(self, group: range, waiting: list[int]) -> None:
-        actions = self._decide(group)
-        for crew in self._crews:
-            self._send(crew, [self._act(slot, actions.get(slot)) for slot in crew.slots if slot in waiting])
-
-    def _decide(self, group: range) -> dict[int, np.ndarray]:
-        """Return the actions of a group's slots; none where the oracle acts."""
-        if self.policy is None:
-            return {}
-        slots = [self.slots[number] for number in group]
-        shape = next(slot.image.shape for slot in slots if slot.image is not None)
-        images = np.zeros((len(slots), *shape), dtype=np.uint8)
-        steps = np.zeros(len(slots), dtype=np.int64)
-        for row, slot in enumerate(slots):
-            if slot.image is not None:
-                images[row], steps[row] = slot.image, slot.step
-        poses = np.stack([slot.pose for slot in slots])
-        decision = self.policy.decide(images, steps, [slot.rng for slot in slots], poses)
-        if decision.q is not None:
-            for row, slot in enumerate(slots):
-                slot.q = float(decision.q[row])
-        return {number: decision.actions[row].copy() for row, number in enumerate(group)}
-
-    def _begin(self, slot: int) -> Command:
-        return Command(slot, episode=self.slots[slot].episodes[0])
-
-    def _act(self, slot: int, action: np.ndarray | None) -> Command:
-        following = self.slots[slot].episodes[1] if len(self.slots[slot].episodes) > 1 else None
-        self.slots[slot].image = None
-        return Command(slot, action=action, following=following)
-
-    def _send(self, crew: _Crew, commands: list[Command]) -> None:
-        crew.pending += commands
-        try:
-            if commands:
-                crew.connection.send(commands)
-        except (BrokenPipeError, ConnectionResetError):
-            pass  # the worker is dead: reading from it says so
-
-    def _listen(self) -> None:
-        """Hear one message of each worker that has something to say; workers that die are replaced."""
-        ready = wait([crew.connection for crew in self._crews if crew.pending])
-        for crew in [crew for crew in self._crews if crew.connection in ready]:
-            try:
-                self._heard(crew, crew.connection.recv())
-            except (EOFError, ConnectionResetError):
-                self._replace(crew)
-
-    def _heard(self, crew: _Crew, message: Begun | Seen | Ended | Idle | Refused) -> None:
-        if isinstance(message, Refused):
-            raise UserError(message.message)
-        slot = self.slots[message.slot]
-        if isinstance(message, Begun):
-            slot.episode, slot.object_ids, slot.frames, slot.q = message.episode, message.object_ids, [], None
-            slot.rng = generator(POLICY_PURPOSE, self.stage.seed, message.episode)
-        elif isinstance(message, Ended):
-            self._finish(slot, message)
-        else:
-            if isinstance(message, Seen):
-                slot.image, slot.step, slot.pose = message.image, message.step, message.pose
-                slot.frames.append(message.image)
-            crew.pending = [command for command in crew.pending if command.slot != message.slot]
-
-    def _finish(self, slot: _Slot, ended: Ended) -> None:
-        assert slot.episode is not None
+    def _filmed(self, simulation: Any, episode: int) -> Film:
+        self.scenes.begin(simulation, episode)
+        played = self.play(simulation, episode)
         row = EpisodeRow(
-            episode=slot.episode,
-            seed=self.stage.seed,
-            object_ids=slot.object_ids,
-            success=bool(ended.info["success"]),
-            lifted_object=ended.info["lifted_object"],
-            steps=ended.steps,
-            end=ended.info["end"],
-            episode_return=ended.reward,
-            q=slot.q,
+            episode=episode,
+            seed=self.scenes.seed,
+            object_ids=simulation.object_ids,
+            success=played.success,
+            lifted_object=played.lifted_object,
+            steps=len(played.actions),
+            end=played.end,
+            episode_return=float(played.rewards.sum()),
+            q=played.q,
         )
-        self.rows[slot.episode] = row
-        self.films.offer(row, [*slot.frames, ended.image])
-        slot.episodes.pop(0)
-        slot.episode, slot.rng = None, None
-        if self.on_row is not None:
-            self.on_row(row)
+        return Film(row, played.frames)
 
-    def _replace(self, crew: _Crew) -> None:
-        """Start a dead worker anew; its episodes begin again, and the one it was busy with must not kill it twice."""
-        crew.process.join()
-        guilty = next(iter(self.slots[crew.pending[0].slot].episodes), self.episodes)
-        self._deaths[guilty] = self._deaths.get(guilty, 0) + 1
-        if self._deaths[guilty] >= ATTEMPTS:
-            raise RolloutError(
-                f"episode {guilty} of seed {self.stage.seed} ended its simulator process {ATTEMPTS} times "
-                f"(exit code {crew.process.exitcode}); nothing was written, please report it with the object set"
-            )
-        crew.connection.close()
-        crew.process, crew.connection = start(self.stage)
-        for number in crew.slots:
-            slot = self.slots[number]
-            slot.episode, slot.rng, slot.image, slot.frames = None, None, None, []
-        crew.pending = []
-        self._send(crew, [self._begin(slot) for slot in crew.slots if self.slots[slot].episodes])
-
-    def _stop(self) -> None:
-        """End the workers, whatever they are doing."""
-        for crew in self._crews:
-            crew.connection.close()
-        for crew in self._crews:
-            crew.process.terminate()
-            crew.process.join()
+    def play(self, simulation: Any, episode: int) -> Played:
+        """Play an episode that `scenes.begin` has started."""
+        return play(simulation, self.policy, generator(_PURPOSE, self.scenes.seed, episode))
 
 
-def run_episodes(stage: Stage, policy: Policy | None, **settings: Any) -> tuple[Sequence[EpisodeRow], FilmKeeper]:
-    """Run an evaluation's episodes; return their rows in order, and the films. See `Rollout` for the settings."""
-    rollout = Rollout(stage, policy, **settings)
-    return rollout.run(), rollout.films
+def run_rollouts(
+    work: Rollouts,
+    episodes: int,
+    settings: EngineSettings,
+    *,
+    films: int = 0,
+    on_row: Callable[[EpisodeRow], None] | None = None,
+) -> tuple[list[EpisodeRow], list[Film]]:
+    """Play the episodes 0 .. `episodes` - 1; return their rows in order, and the films that are kept.
+
+    Args:
+        work: scenes and policy.
+        episodes: how many, at least 1; episode i is the same in a longer evaluation.
+        settings: which engine, how many workers.
+        films: number of episodes whose frames are kept.
+        on_row: called for each finished episode, in no fixed order.
+
+    Raises:
+        UserError: the object set or a user's policy is at fault, or some episodes ended two workers each.
+    """
+    rows: dict[int, EpisodeRow] = {}
+    keeper = FilmKeeper(films)
+    units = (range(first, min(first + EPISODES_PER_UNIT, episodes)) for first in range(0, episodes, EPISODES_PER_UNIT))
+    for _, played in run(work, units, settings, name=_name, units_per_worker=UNITS_PER_WORKER):
+        for film in played:
+            rows[film.row.episode] = film.row
+            keeper.offer(film)
+            if on_row is not None:
+                on_row(film.row)
+    return [rows[episode] for episode in range(episodes)], keeper.chosen()
+
+
+def _name(episodes: range) -> str:
+    return f"episodes {episodes[0]} to {episodes[-1]}"

@@ -1,49 +1,18 @@
-"""The settings of `grasp-eval`, and of the search (CEM) with which a Q-function picks its actions.
-
-They are frozen dataclasses: the command line, `jobs.toml` and `eval.json` all carry these same names.
-"""
+"""The settings of `grasp-eval`: the command line, `jobs.toml` and `eval.json` carry these same names."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from graspq.common.errors import UserError
-from graspq.common.options import Settings, parse_count, setting
-from graspq.train.selection import Answer, StepMode
+from graspq.common.options import parse_count, setting
+from graspq.engine import EngineSettings
+from graspq.train.selection import Answer, CemSettings, StepMode
 
 Device = Literal["auto", "cpu", "cuda"]
-GROUP = 8  # environments of a batch; larger ones are cheaper, but leave workers waiting for the slowest of them
-SYNTHETIC_STEP_HELP = (
-    "How a motion of supervised becomes a step: scaled to the action limits, or each component clipped to them."
-)
 
 
 @dataclass(frozen=True)
-class CemSettings(Settings):
-    """The cross-entropy method over actions; see `graspq.train.selection.cross_entropy_method`.
-
-    Source: Quillen et al. 2018 (3 iterations of 64 samples).
-    """
-
-    iterations: int = setting(3, help="Iterations of CEM.", minimum=1, maximum=100)
-    samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
-    elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
-    answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
-    synthetic_step: StepMode = setting("scale", help=SYNTHETIC_STEP_HELP)
-
-    def __post_init__(self) -> None:
-        """Check the ranges, and that there are no more elites than samples.
-
-        Raises:
-            UserError: one of them does not hold.
-        """
-        super().__post_init__()
-        if self.elites > self.samples:
-            raise UserError(f"CEM elites: expected at most as many as samples ({self.samples}), got {self.elites}")
-
-
-@dataclass(frozen=True)
-class EvalSettings(Settings):
+class EvalSettings(EngineSettings):
     """Settings of `grasp-eval`; see each field's help."""
 
     runs: tuple[str, ...] = setting((), help="Run folders, or globs of them.", positional=True, metavar="[RUN]...")
@@ -52,7 +21,8 @@ class EvalSettings(Settings):
     )
     task: str | None = setting(
         None,
-        help="Task: regular or targeted. Default: the run's own; without a run that of the runs beside, else regular.",
+        help="Task: regular, targeted or module:task. Default: the run's own; without a run that of the runs beside, "
+        "else regular.",
     )
     split: str = setting("test", help="Split of the object set; test-clutter for unseen distractors (targeted).")
     episodes: int = setting(1000, help="Episodes (grasps) of each job, such as 200 or 1k.", parse=parse_count)
@@ -61,17 +31,16 @@ class EvalSettings(Settings):
         None, help="Folder of the object set. Default: the one the run's data were made with, else the task's own."
     )
     checkpoint: int | None = setting(None, help="Training step of the checkpoint. Default: the last.", minimum=0)
-    workers: int | None = setting(None, help="Simulator processes, all cores by default; changes no result.", minimum=1)
-    environments: int = setting(
-        32, help=f"Simulated environments; groups of {GROUP} act in lockstep, as a batch.", minimum=1, maximum=1024
-    )
     cem_iterations: int = setting(CemSettings.iterations, help="Iterations of CEM.", minimum=1, maximum=100)
     cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
     cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
     cem_answer: Answer = setting(
         CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
     )
-    cem_synthetic_step: StepMode = setting(CemSettings.synthetic_step, help=SYNTHETIC_STEP_HELP)
+    cem_synthetic_step: StepMode = setting(
+        CemSettings.synthetic_step,
+        help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them.",
+    )
     device: Device = setting("auto", help="Where the network runs.")
     out: Path | None = setting(
         None, help="Folder for the results and their table. Default: RUN/evaluations/, runs/baselines/ without a run."

@@ -4,15 +4,15 @@ Filming changes nothing: the camera reads the world, and decisions are still mad
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.common.files import committed
-from graspq.common.seeding import generator
-from graspq.evaluate.policies import Policy
-from graspq.evaluate.workers import Stage, begin_episode
+from graspq.common.machine import one_thread
+from graspq.evaluate.rollout import Rollouts
+from graspq.objects.object_set import ObjectSet
 
 if TYPE_CHECKING:
     from graspq.sim.episode import GraspSimulation
@@ -34,78 +34,33 @@ def check_video_path(path: Path) -> None:
         raise UserError(f"--video: {path} should end in {' or '.join(FORMATS)}")
 
 
-class _Filming:
-    """Takes a frame after every few simulation steps of a simulation, while it is entered."""
-
-    def __init__(self, simulation: "GraspSimulation", size: int) -> None:
-        self.simulation, self.size = simulation, size
-        self.frames: list[np.ndarray] = []
-        self._steps = 0
-        self._advance = simulation.world.step
-
-    def shoot(self, times: int = 1) -> None:
-        """Add the present view."""
-        self.frames += [self.simulation.render(self.size)] * times
-
-    def _step(self, count: int = 1) -> None:
-        for _ in range(count):
-            self._advance(1)
-            self._steps += 1
-            if self._steps % STEPS_PER_FRAME == 0:
-                self.shoot()
-
-    def __enter__(self) -> "_Filming":
-        # All motion of an episode passes through the world's step: standing in for it shows every moment.
-        self.simulation.world.step = self._step  # type: ignore[method-assign]
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self.simulation.world.step = self._advance  # type: ignore[method-assign]
-
-
-def film_episode(
-    simulation: "GraspSimulation", stage: Stage, policy: Policy | None, episode: int, environments: int, size: int
-) -> tuple[np.ndarray, bool]:
-    """Run one episode as the evaluation did, and film it.
+def film_episode(simulation: "GraspSimulation", rollouts: Rollouts, episode: int, size: int) -> tuple[np.ndarray, bool]:
+    """Play one episode as the evaluation did, and film it.
 
     Args:
-        simulation: of the stage's task and objects.
-        stage: what determines the scenes.
-        policy: who decides; None for the oracle.
+        simulation: of the scenes' task and objects.
+        rollouts: scenes and policy.
         episode: index of the episode.
-        environments: rows of the evaluation's batches, so that every decision comes out the same.
         size: width and height in pixels.
 
     Returns:
         uint8 [F, size, size, 3] frames, and whether the grasp succeeded.
     """
-    from graspq.policies.oracle import Oracle
+    frames: list[np.ndarray] = []
+    steps = 0
 
-    seen = begin_episode(simulation, simulation.objects, stage.split, stage.seed, episode)
-    rngs: list[np.random.Generator | None] = [None] * environments
-    row, oracle = episode % environments, Oracle()
-    rngs[row] = generator("evaluate/policy", stage.seed, episode)
-    images = np.zeros((environments, *seen.image.shape), dtype=np.uint8)
-    steps = np.zeros(environments, dtype=np.int64)
-    poses = np.zeros((environments, 4), dtype=np.float32)
-    if policy is None:
-        oracle.begin(simulation)
-    with _Filming(simulation, size) as filming:
-        filming.shoot(PAUSE)
-        while True:
-            images[row], steps[row] = seen.image, seen.step
-            poses[row] = seen.gripper_pose
-            if policy is None:
-                action = oracle.act(seen, np.random.default_rng(0))
-            else:
-                action = policy.decide(images, steps, rngs, poses).actions[row]
-            outcome = simulation.step(action)
-            seen = outcome.observation
-            if outcome.terminated:
-                break
-        filming.shoot(2 * PAUSE)
-    success = bool(outcome.info["success"])
-    return _bordered(np.stack(filming.frames), success), success
+    def film() -> None:
+        nonlocal steps
+        steps += 1
+        if steps % STEPS_PER_FRAME == 0:
+            frames.append(simulation.render(size))
+
+    rollouts.scenes.begin(simulation, episode)
+    frames += [simulation.render(size)] * PAUSE
+    with simulation.world.watched(film):
+        played = rollouts.play(simulation, episode)
+    frames += [simulation.render(size)] * 2 * PAUSE
+    return _bordered(np.stack(frames), played.success), played.success
 
 
 def _bordered(frames: np.ndarray, success: bool) -> np.ndarray:
@@ -117,34 +72,24 @@ def _bordered(frames: np.ndarray, success: bool) -> np.ndarray:
     return frames
 
 
-def write_video(
-    path: Path, stage: Stage, policy: Policy | None, *, episodes: int, environments: int, size: int
-) -> list[bool]:
+def write_video(path: Path, rollouts: Rollouts, *, episodes: int, size: int) -> list[bool]:
     """Film the first episodes of an evaluation into an MP4 or GIF; return which of them succeeded.
 
     Raises:
         UserError: the ending is unknown or the file cannot be written.
     """
     check_video_path(path)
-    from graspq.evaluate.workers import quiet_errors
+    from graspq.sim.episode import GraspSimulation
 
-    with quiet_errors():
-        from graspq.sim.episode import GraspSimulation
-    from graspq.objects.object_set import ObjectSet
-    from graspq.sim.task import task_from_json
-
-    reels, successes = [], []
-    with GraspSimulation(task_from_json(stage.task), ObjectSet.load(Path(stage.objects))) as simulation:
-        for episode in range(episodes):
-            frames, success = film_episode(simulation, stage, policy, episode, environments, size)
-            reels.append(frames)
-            successes.append(success)
+    objects = ObjectSet.load(rollouts.scenes.objects)
+    with one_thread(), GraspSimulation(rollouts.scenes.task, objects) as simulation:
+        filmed = [film_episode(simulation, rollouts, episode, size) for episode in range(episodes)]
     try:
         with committed(path) as temporary:
-            _encode(temporary, np.concatenate(reels))
+            _encode(temporary, np.concatenate([frames for frames, _ in filmed]))
     except OSError as error:
         raise UserError(f"{path}: cannot write the video here ({error}); choose another --video") from None
-    return successes
+    return [success for _, success in filmed]
 
 
 def _encode(path: Path, frames: np.ndarray) -> None:

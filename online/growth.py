@@ -7,11 +7,8 @@ again, one that is in the manifest never is.
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
@@ -108,12 +105,12 @@ class GrowingDataset:
             growing.manifest = write_card(folder, manifest)  # a killed writer may have left the one of the round before
         return growing
 
-    def collect(self, number: int, make_policy: Callable[[], Policy]) -> ShardEntry:
+    def collect(self, number: int, policy: Policy) -> ShardEntry:
         """Return the shard of round `number`, from 0, which is collected and committed if it is not there.
 
         Args:
             number: at most the number of finished rounds.
-            make_policy: who acts.
+            policy: who acts.
 
         Raises:
             UserError: a block killed its worker twice, or the disk is full.
@@ -121,8 +118,8 @@ class GrowingDataset:
         if number < len(self.blocks):
             return self.manifest.shards[number]
         blocks = round_blocks(self.collection, self.grasps, number)
-        work = Collection(self.task.settings.to_json(), self.folder / "objects", self.collection, make_policy)
-        with _threads_kept(), contextlib.closing(collected(work, blocks, self.engine)) as found:
+        work = Collection(self.task.settings.to_json(), self.folder / "objects", self.collection, policy)
+        with contextlib.closing(collected(work, blocks, self.engine)) as found:
             by_block = dict(found)
         episodes = [episode for block in blocks for episode in by_block[block]]
         entry = write_shard(self.folder, self.manifest, blocks[0].number, len(blocks), episodes)
@@ -144,16 +141,6 @@ class GrowingDataset:
                 f"{self.folder}: {entry.name} is not round {number + 1}, which has {self.grasps} grasps from block "
                 f"{first} on; choose another run folder with --out"
             )
-
-
-@contextlib.contextmanager
-def _threads_kept() -> Iterator[None]:
-    """Give training its threads back: a policy that acts in this process takes one."""
-    threads = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _description(

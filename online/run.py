@@ -14,12 +14,13 @@ from graspq.common.seeding import generator
 from graspq.datasets.dataset import open_shards
 from graspq.datasets.manifest import ShardEntry
 from graspq.datasets.pool import ShardPool
-from graspq.evaluate.object_sets import find_object_set
+from graspq.evaluate.scenes import find_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.online.growth import GrowingDataset
 from graspq.online.plan import Plan
-from graspq.online.policy import LatestPolicy
 from graspq.online.pools import PoolOfRounds
+from graspq.policies.exploring import ExploringPolicy
+from graspq.policies.of_run import load
 from graspq.policies.random import RandomPolicy
 from graspq.sim.task import Task, task_from_json
 from graspq.train.loop import Session, session
@@ -90,7 +91,8 @@ class _Rounds:
             self.current.save()
         exploration = online.exploration(step)
         random = RandomPolicy(online.descend_probability)
-        policy = LatestPolicy(self.current.run.folder, step, exploration, random, online.cem)
+        latest = load(self.current.run.folder, step, cem=online.cem, device="cpu")
+        policy = ExploringPolicy(exploration, random, latest)
         entry = self.growing.collect(number, policy)
         if number + 1 not in self._noted:
             self.current.run.append_metrics({"step": step, "online": _row(number, entry, exploration, self.growing)})

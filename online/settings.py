@@ -11,8 +11,7 @@ from typing import Any
 from graspq.common.options import parse_count, setting
 from graspq.engine import EngineSettings
 from graspq.engine.settings import ENGINE_OPTIONS
-from graspq.evaluate.settings import CemSettings
-from graspq.train.selection import Answer
+from graspq.train.selection import Answer, CemSettings
 from graspq.train.settings import TrainOptions, TrainSettings
 
 # They may differ when a run is resumed: they do not decide what is collected.

@@ -5,6 +5,7 @@ Frames: w runs along the pads, c along the closing direction, both horizontal; z
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -60,6 +61,10 @@ class Oracle:
             # Straight to the goal: all components arrive together.
             action = action / np.abs(action).max()
         return action.astype(np.float32)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what tells it from others: there is one oracle."""
+        return {}
 
     def plan(self, simulation: GraspSimulation) -> Grasp | None:
         """Return the best grasp of the scene as it lies, or None where no candidate is free."""

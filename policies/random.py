@@ -1,7 +1,7 @@
 """The random policy of the paper's code: uniform actions that mostly descend."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,3 +33,7 @@ class RandomPolicy(Settings):
         if rng.random() < self.descend_probability:
             action[2] = -1.0
         return action.astype(np.float32)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what tells it from others."""
+        return {"random": self.to_json()}

@@ -4,12 +4,14 @@ Dimension key: T steps of an episode, A parts of an action, H W C image, K objec
 """
 
 import dataclasses
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
-from graspq.sim.episode import GraspSimulation
 from graspq.sim.observation import Observation
+
+if TYPE_CHECKING:
+    from graspq.sim.episode import GraspSimulation
 
 
 class Policy(Protocol):
@@ -65,7 +67,9 @@ class Played:
         return np.stack([*(observation.image for observation in self.observations), self.last])
 
 
-def play(simulation: GraspSimulation, policy: Policy, rng: np.random.Generator, *, observe_end: bool = True) -> Played:
+def play(
+    simulation: "GraspSimulation", policy: Policy, rng: np.random.Generator, *, observe_end: bool = True
+) -> Played:
     """Play an episode that `simulation.reset` has just started to its end.
 
     Args:

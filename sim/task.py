@@ -152,6 +152,11 @@ class RegularGrasping:
         """Return the same task with other numbers."""
         return dataclasses.replace(self, settings=settings)
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Travel to other processes by name where the module of the task is a user's own: they import it."""
+        own = ":" in self.settings.name
+        return (task_from_json, (self.settings.to_json(),)) if own else super().__reduce_ex__(protocol)
+
     def draw(self, objects: ObjectSet, split: str, rng: np.random.Generator) -> tuple[str, ...]:
         """Return the ids of `objects_per_bin` different objects of the split; see `Task.draw`."""
         check_split(self, split)

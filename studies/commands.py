@@ -13,7 +13,7 @@ import click
 
 from graspq.common.errors import UserError
 from graspq.datasets.dataset import open_shards
-from graspq.evaluate.object_sets import SET_FILE
+from graspq.evaluate.scenes import SET_FILE
 from graspq.studies.plan import GRASPS_PER_ROUND, STEPS_PER_ROUND, Job, Plan
 from graspq.studies.state import SCENES_SEED, State, run_folder, run_of
 
@@ -118,7 +118,7 @@ def check_data(folder: Path, plan: Plan) -> None:
     """
     from graspq.evaluate.evaluation import prepare
     from graspq.evaluate.jobs import Job as Evaluation
-    from graspq.evaluate.policies import RANDOM
+    from graspq.evaluate.records import RANDOM
     from graspq.evaluate.settings import EvalSettings
 
     pool = open_shards(plan.shards, verify=False)

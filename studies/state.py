@@ -10,9 +10,9 @@ from typing import Any, Literal
 from graspq.common.errors import UserError
 from graspq.common.files import read_json, write_json
 from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
-from graspq.evaluate.settings import CemSettings
 from graspq.studies.plan import Job, Plan
 from graspq.train.run import Run, step_of
+from graspq.train.selection import CemSettings
 
 Status = Literal["done", "failed", "to do"]
 SCENES_SEED = 0

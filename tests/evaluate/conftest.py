@@ -36,13 +36,24 @@ def dataset(
 def run_folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of `mc` with the paper's network, four steps long, with two validations and two checkpoints."""
     from graspq.train.loop import train
-    from graspq.train.settings import preset_settings
+    from graspq.train.settings import complete
 
     folder = tmp_path_factory.mktemp("runs") / "mc"
-    settings = preset_settings(
-        "paper", algo="mc", shards=(str(dataset),), out=folder, steps=4, batch_size=8, log_every=1,
-        validate_every=2, checkpoint_every=2, validation_fraction=0.25, device="cpu", precision="float32", threads=1,
-    )  # fmt: skip
+    settings = complete(
+        {
+            "algo": "mc",
+            "shards": (str(dataset),),
+            "out": folder,
+            "steps": 4,
+            "batch_size": 8,
+            "save_every": 2,
+            "validation_fraction": 0.25,
+            "device": "cpu",
+            "precision": "float32",
+            "threads": 1,
+        },
+        "paper",
+    )
     train(settings)
     return folder
 

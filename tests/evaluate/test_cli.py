@@ -20,7 +20,7 @@ from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.task import TASKS
 
-SMALL = ("--episodes", "2", "--environments", "2", "--workers", "1")
+SMALL = ("--episodes", "2", "--workers", "0")
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,7 @@ def workplace(run_folder: Path, dataset: Path, tmp_path_factory: pytest.TempPath
     from graspq.evaluate.settings import EvalSettings
 
     out = tmp_path_factory.mktemp("scores")
-    settings = EvalSettings(
-        runs=(str(run_folder),), policy=("random",), episodes=2, environments=2, workers=1, films=2, out=out
-    )
+    settings = EvalSettings(runs=(str(run_folder),), policy=("random",), episodes=2, workers=0, films=2, out=out)
     return SimpleNamespace(out=out, settings=settings, status=evaluate(settings))
 
 
@@ -90,7 +88,7 @@ def test_policies_without_a_run_meet_the_scenes_of_the_run_beside_them(
         workplace.settings,
     )
     assert run.prepared is not None and random.prepared is not None and oracle.prepared is not None
-    assert run.prepared.task.finger_force == 17.0
+    assert run.prepared.task.settings.finger_force == 17.0
     assert run.prepared.task == random.prepared.task == oracle.prepared.task
     assert random.status == "to do"
 
@@ -110,7 +108,9 @@ def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_hav
     def tasks(*runs: Path, objects: Path | None = None) -> list[str]:
         settings = replace(workplace.settings, runs=tuple(map(str, runs)), policy=("oracle",), objects=objects)
         entries = make_plan(jobs_from_settings(settings), settings)
-        return [entry.prepared.task.name if entry.prepared is not None else str(entry.error) for entry in entries]
+        return [
+            entry.prepared.task.settings.name if entry.prepared is not None else str(entry.error) for entry in entries
+        ]
 
     assert tasks(targeted, objects=targeted_objects.folder) == ["targeted", "targeted"]
     assert tasks(run_folder) == ["regular", "regular"]
@@ -151,7 +151,7 @@ def test_a_failed_job_leaves_the_others_alone_and_shows_in_the_exit_status(
     runs = json.dumps([str(tmp_path / "absent"), str(run_folder)])
     table = f'[[jobs]]\nruns = {runs}\npolicies = ["random"]\n'
     jobs.write_text("episodes = 2\n" + table)
-    done = command("grasp-eval", "--jobs", jobs, "--environments", "2", "--out", out)
+    done = command("grasp-eval", "--jobs", jobs, "--out", out)
     assert done.code == 1
     assert "cannot run" in done.out and "absent" in done.err
     rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
@@ -166,12 +166,12 @@ def test_a_failed_job_leaves_the_others_alone_and_shows_in_the_exit_status(
 def test_a_users_policy_is_scored_and_filmed_by_the_same_command(
     objects_folder: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = ("class Down:", "    def act(self, image, step):", "        return [0, 0, -1, 0]", "make = Down")
+    source = ("class Down:", "    def act(self, observation, rng):", "        return [0, 0, -1, 0]", "make = Down")
     (tmp_path / "straight_down.py").write_text("\n".join(source) + "\n")
     monkeypatch.chdir(tmp_path)
     done = command(
         "grasp-eval", "--policy", "straight_down:make", "--objects", objects_folder, "--split", "train",
-        "--episodes", "1", "--environments", "1", "--workers", "1",
+        "--episodes", "1", "--workers", "1",
         "--video", "down.gif", "--video-size", "64", "--video-episodes", "1",
     )  # fmt: skip
     assert done.code == 0, done.err
@@ -266,14 +266,24 @@ def test_a_run_of_a_users_own_row_is_evaluated_where_its_module_lies_and_acts_by
     dataset: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from graspq.train.loop import train
-    from graspq.train.settings import preset_settings
+    from graspq.train.settings import complete
 
     (tmp_path / "own_rows_of_a_user.py").write_text(OWN_ROW)
     monkeypatch.chdir(tmp_path)
-    settings = preset_settings(
-        "paper", algo="own_rows_of_a_user:row", shards=(str(dataset),), out=tmp_path / "run", steps=1, batch_size=8,
-        validation_fraction=0.0, device="cpu", precision="float32", threads=1,
-    )  # fmt: skip
+    settings = complete(
+        {
+            "algo": "own_rows_of_a_user:row",
+            "shards": (str(dataset),),
+            "out": tmp_path / "run",
+            "steps": 1,
+            "batch_size": 8,
+            "validation_fraction": 0.0,
+            "device": "cpu",
+            "precision": "float32",
+            "threads": 1,
+        },
+        "paper",
+    )
     train(settings)
     done = command("grasp-eval", "run", *SMALL, "--out", "scores", "--films", "0")
     assert done.code == 0, done.err

@@ -18,6 +18,10 @@ def frames_of(episode: int, count: int = 3) -> list[np.ndarray]:
     return [np.full((8, 8, 3), 10 * episode + step, dtype=np.uint8) for step in range(count)]
 
 
+def film_of(episode: int, success: bool) -> Film:
+    return Film(row_of(episode, success), np.stack(frames_of(episode)))
+
+
 @pytest.mark.parametrize(
     ("successes", "expected"),
     [
@@ -31,13 +35,13 @@ def test_the_first_of_both_kinds_are_kept_in_whatever_order_they_end(successes: 
     for seed in range(5):
         keeper = FilmKeeper(4)
         for episode in np.random.default_rng(seed).permutation(10).tolist():
-            keeper.offer(row_of(episode, episode in successes), frames_of(episode))
+            keeper.offer(film_of(episode, episode in successes))
         assert [film.row.episode for film in keeper.chosen()] == expected
 
 
 def test_no_films_are_kept_when_none_are_wanted() -> None:
     keeper = FilmKeeper(0)
-    keeper.offer(row_of(0, True), frames_of(0))
+    keeper.offer(film_of(0, True))
     assert keeper.chosen() == []
 
 

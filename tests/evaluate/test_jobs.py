@@ -6,7 +6,8 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.evaluate.jobs import jobs_from_settings
-from graspq.evaluate.settings import CemSettings, EvalSettings
+from graspq.evaluate.settings import EvalSettings
+from graspq.train.selection import CemSettings
 
 
 def make_run(folder: Path) -> Path:

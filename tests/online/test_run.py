@@ -16,15 +16,15 @@ from graspq.common.files import sha256_of
 from graspq.datagen import collect
 from graspq.datasets.dataset import Dataset, open_shards
 from graspq.datasets.verify import verify
-from graspq.evaluate.runs import load_run
-from graspq.evaluate.settings import CemSettings
 from graspq.objects.object_set import ObjectSet
 from graspq.online import growth
 from graspq.online.plan import Plan
 from graspq.online.run import run_online
+from graspq.policies.of_run import load
 from graspq.train import loop
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.run import Run
+from graspq.train.selection import CemSettings
 
 Make = Callable[..., Plan]
 
@@ -82,9 +82,9 @@ def test_grasp_train_could_read_base_and_new_grasps_as_one_pool(unbroken: Run, b
 
 
 def test_the_run_folder_is_one_for_evaluation(unbroken: Run) -> None:
-    policy, facts = load_run(unbroken.folder, None, CemSettings(), "cpu")
-    assert (facts.algo, facts.step, facts.task["name"]) == ("dql", 24, "regular")
-    assert policy.identity() == {"cem": CemSettings().to_json()}
+    policy = load(unbroken.folder, device="cpu")
+    assert (policy.name, policy.origin.task["name"]) == ("dql@24", "regular")
+    assert policy.identity()["cem"] == CemSettings().to_json()
 
 
 def test_the_start_runs_weights_and_moments_are_taken_over_and_it_is_left_alone(

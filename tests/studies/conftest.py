@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from graspq.evaluate.records import EpisodeRow, write_rows, write_summary
-from graspq.evaluate.settings import CemSettings
 from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
 from graspq.studies.plan import Job, Plan
 from graspq.studies.state import run_folder
 from graspq.train.run import Run, checkpoint_name
+from graspq.train.selection import CemSettings
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
