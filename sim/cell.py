@@ -91,8 +91,13 @@ def settle(world: World, bodies: Sequence[Body], task: TaskSettings) -> int:
         if taken >= 100 and max(body.speed() for body in bodies) < _REST_SPEED:
             break
     for body in bodies:
-        body.change_dynamics(activationState=bullet.ACTIVATION_STATE_SLEEP | bullet.ACTIVATION_STATE_ENABLE_SLEEPING)
+        sleep(body)
     return taken
+
+
+def sleep(body: Body) -> None:
+    """Let an object sleep until something touches it."""
+    body.change_dynamics(activationState=bullet.ACTIVATION_STATE_SLEEP | bullet.ACTIVATION_STATE_ENABLE_SLEEPING)
 
 
 def wake(body: Body) -> None:

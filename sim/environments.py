@@ -1,26 +1,31 @@
-"""The two tasks as Gymnasium environments: `graspq/RegularGrasping-v0` and `graspq/TargetedGrasping-v0`.
+"""Tasks as Gymnasium environments: `graspq/RegularGrasping-v0`, `graspq/TargetedGrasping-v0`, and any task.
 
 Each environment owns its physics client, so several live in one process.
 """
 
+import os
+import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 
 from graspq.common.errors import UserError
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.episode import GraspSimulation
-from graspq.sim.task import EPISODES_PER_BIN, TASKS, check_split
+from graspq.sim.task import EPISODES_PER_BIN, check_split, task_named
 
 _RENDER_SIZE = 256
+_SCENE = ("object_ids", "object_poses")
 
 
-class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
-    """Grasp an object from a bin.
+class Grasping(gymnasium.Env[dict[str, Any], np.ndarray], EzPickle):
+    """Grasp an object from a bin: any of five (regular), or one of three purple crosses among four others (targeted).
 
     | | what | shape, range, unit |
     |---|---|---|
@@ -32,30 +37,44 @@ class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
     | truncated | never | |
 
     `reset(seed=s)` fills a new bin as a function of s; `reset()` drops the same objects anew and switches them every 20
-    episodes. `info` holds `gripper_pose` and, at the end, `end`, `success` and `lifted_object`.
+    episodes; `reset(options={"scene": row})` lays objects as a row of a dataset's episodes table says. `info` holds
+    `gripper_pose` and, at the end, `end`, `success`, `lifted_object` and `final_pose`.
+
+    A copy, also by `pickle`, is a new environment made with the same arguments; it begins with a `reset`.
 
     Source: Quillen et al. 2018, section IV.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 12}  # noqa: RUF012  (Gymnasium declares it as an instance variable)
-    task_name: ClassVar[str]
 
-    def __init__(self, objects: str | Path | None = None, split: str = "train", render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        task: str = "regular",
+        objects: str | Path | None = None,
+        split: str = "train",
+        render_mode: str | None = None,
+    ) -> None:
         """Make the environment.
 
         Args:
+            task: `regular`, `targeted`, or `module:task` of your own.
             objects: folder of an object set; the project's own set by default.
             split: `train` or `test`; the targeted task also has `test-clutter`.
             render_mode: `rgb_array`, `human` (PyBullet's window) or None.
 
         Raises:
-            UserError: the folder, the split or the render mode is not as expected.
+            UserError: the task, the folder, the split or the render mode is not as expected.
         """
+        EzPickle.__init__(self, task, objects, split, render_mode)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise UserError(f"render_mode {render_mode!r}: choose from rgb_array, human or None")
-        self.task = TASKS[self.task_name]
+        if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            # What checks an environment tries all its modes.
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
+        self.task = task_named(task)
         check_split(self.task, split)
-        self.objects = ObjectSet.load(objects) if objects is not None else default_object_set(self.task.object_set)
+        own = self.task.object_set
+        self.objects = ObjectSet.load(Path(objects)) if objects is not None else default_object_set(own)
         self.split, self.render_mode = split, render_mode
         size = self.task.settings.image_size
         self.observation_space = spaces.Dict(
@@ -71,8 +90,23 @@ class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see the class. `options` takes nothing."""
+        """Start an episode; see the class.
+
+        Args:
+            seed: of a new bin.
+            options: `scene`: a mapping with `object_ids` (of this environment's object set) and `object_poses`
+                ([K, 7]: metres, quaternion xyzw), such as a row of the episodes table; nothing is dropped then.
+
+        Raises:
+            UserError: an option is unknown, or the scene is not as expected.
+        """
         super().reset(seed=seed)
+        scene = _scene(options)
+        if scene is not None:
+            self.simulation.load(scene[0])
+            self.simulation.lay(scene[1])
+            self._episodes_in_bin = 1
+            return self._observation(), self._info()
         if seed is not None or self._episodes_in_bin >= EPISODES_PER_BIN:
             self.simulation.load(self.task.draw(self.objects, self.split, self.np_random))
             self._episodes_in_bin = 0
@@ -101,15 +135,24 @@ class _Grasping(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.simulation.close()
 
 
-class RegularGrasping(_Grasping):
-    """Regular grasping: five objects in the bin, any lifted object is a success."""
-
-    __doc__ = f"{__doc__}\n\n    {_Grasping.__doc__}"
-    task_name = "regular"
-
-
-class TargetedGrasping(_Grasping):
-    """Targeted grasping in clutter: three purple crosses among four other objects; only a lifted cross is a success."""
-
-    __doc__ = f"{__doc__}\n\n    {_Grasping.__doc__}"
-    task_name = "targeted"
+def _scene(options: dict[str, Any] | None) -> tuple[list[str], np.ndarray] | None:
+    """Return the ids [K] and poses, float [K, 7], of the scene that options ask for."""
+    unknown = sorted(set(options or {}) - {"scene"})
+    if unknown:
+        raise UserError(f"reset: unknown option {unknown[0]!r}; expected 'scene' or none")
+    scene = (options or {}).get("scene")
+    if scene is None:
+        return None
+    if not isinstance(scene, Mapping) or not set(_SCENE) <= set(scene):
+        raise UserError(f"reset: option 'scene': expected a mapping with {' and '.join(_SCENE)}")
+    ids = [str(object_id) for object_id in scene["object_ids"]]
+    try:
+        poses = np.asarray([np.asarray(pose, dtype=float) for pose in scene["object_poses"]])
+    except (TypeError, ValueError):
+        poses = np.zeros(0)
+    if not ids or poses.shape != (len(ids), 7) or not np.isfinite(poses).all():
+        raise UserError(
+            f"reset: option 'scene': expected object_poses of {len(ids)} rows of 7 finite numbers, one for each of "
+            f"object_ids, got the shape {list(poses.shape)}"
+        )
+    return ids, poses

@@ -71,6 +71,21 @@ class GraspSimulation:
         self.arm.park()
         cell.drop(self.bodies, self.task.settings, rng)
         cell.settle(self.world, self.bodies, self.task.settings)
+        return self._started()
+
+    def lay(self, poses: np.ndarray) -> Observation:
+        """Lay the objects at rest as `object_poses` recorded them, home the arm and return the first observation.
+
+        Args:
+            poses: float [K, 7], position (metres) and quaternion (xyzw) of each loaded object.
+        """
+        self.arm.park()
+        for body, pose in zip(self.bodies, poses, strict=True):
+            body.set_pose(pose[:3], pose[3:])
+            cell.sleep(body)
+        return self._started()
+
+    def _started(self) -> Observation:
         self.arm.place(self.arm.home())
         self.step_count, self.terminated = 0, False
         self._observation = None

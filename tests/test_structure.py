@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "train": {"datasets", "common"},
     "policies": {"sim", "train", "objects", "common"},
     "datagen": {"engine", "policies", "sim", "objects", "datasets", "common"},
-    "evaluate": {"policies", "sim", "objects", "train", "datasets", "common"},
+    "evaluate": {"engine", "policies", "sim", "objects", "train", "datasets", "common"},
     "report": {"evaluate", "train", "datasets", "objects", "common"},
     "online": {"engine", "policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
     "studies": {"policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "report", "common"},
