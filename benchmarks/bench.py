@@ -2,61 +2,104 @@
 
     make bench
 
-Each part is a script of this folder in a process of its own, which runs its rivals itself. What a part measured is kept
-in `--work`: the same command goes on where it was stopped, and `--again PART` measures one anew. Nothing else should
-run meanwhile; it takes about two hours on 2 cores. Every part says on which day and with which code it was measured.
+Each part is a script of this folder, run in a process of its own. What a part measured is kept in `--work`: the same
+command goes on where it was stopped, and `--again PART` measures one anew. Parts that are not asked for stay as they
+were published. Nothing else should run meanwhile; it takes about two hours on 2 cores.
 """
 
-import dataclasses
+import importlib
 import re
 import shutil
-import subprocess
-import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
-from breakdown import section
-from ratios import Found, ratio_rows
-from timing import table
 
+from graspq.benchmarks.measuring import Call, Ratio, apart, table
 from graspq.common.errors import UserError
 from graspq.common.files import read_json, write_json, write_text
 from graspq.common.machine import available_cores
-from graspq.common.options import Command
+from graspq.common.options import Command, Settings, options_from, setting
+from graspq.common.text import markdown
 
-FOLDER = Path(__file__).resolve().parent
 BEGIN, END = "<!-- made by benchmarks/bench.py -->", "<!-- end -->"
-
-
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """A script and its arguments.
-
-    Attributes:
-        script: its name without `.py`.
-        arguments: `{shards}` and `{run}` stand for the options of this command, `{own}` for a folder of the part.
-    """
-
-    script: str
-    arguments: tuple[str, ...] = ()
-
-    def words(self, **given: str) -> list[str]:
-        """Return the command's words after `python`, without `--out`."""
-        return [f"benchmarks/{self.script}.py", *(word.format(**given) for word in self.arguments)]
-
-
+# {shards} and {run} stand for the options of this command, {work} for a folder of the part.
 PARTS = {
-    "collection": Part("collection", ("--part", "pace", "--part", "profile", "--part", "scaling")),
-    "worker_memory": Part("collection", ("--part", "memory", "--scenes", "10000")),
-    "loading": Part("loading", ("--shards", "{shards}", "--part", "speed", "--part", "waiting")),
-    "streaming_memory": Part("loading", ("--shards", "{shards}", "--part", "memory")),
-    "training": Part("training", ("--shards", "{shards}")),
-    "estimators": Part("estimators", ("--shards", "{shards}")),
-    "roofline": Part("roofline", ("--shards", "{shards}")),
-    "decision": Part("decision"),
-    "evaluation": Part("evaluation", ("{run}", "--episodes", "512", "--rival-episodes", "128")),
-    "time_to_quality": Part("time_to_quality", ("--shards", "{shards}", "--seeds", "3", "--work", "{own}")),
+    "collection": "collection",
+    "worker_memory": "worker_memory --scenes 10000",
+    "loading": "loading --shards {shards}",
+    "streaming": "streaming --shards {shards}",
+    "training": "training --shards {shards}",
+    "estimators": "estimators --shards {shards}",
+    "decision": "decision",
+    "evaluation": "evaluation {run} --episodes 512 --rival-episodes 128",
+    "time_to_quality": "time_to_quality --shards {shards} --seeds 3 --work {work}",
 }
+PUBLISHED_TABLES = ("Where a grasp's time goes", "Where a training step's time goes")
+
+
+@dataclass(frozen=True)
+class BenchSettings(Settings):
+    """Settings of this command."""
+
+    shards: str = setting("data/regular-10k", help="Dataset folder.")
+    run: str = setting("runs/mc-regular-10k-seed0", help="Run that is evaluated.")
+    part: tuple[str, ...] = setting((), help=f"What to measure: {', '.join(PARTS)}. Default: all.")
+    again: tuple[str, ...] = setting((), help="Measure this part anew; may be repeated.")
+    work: Path = setting(Path("runs/bench"), help="Folder of the parts' figures.")
+    out: Path = setting(Path("results/bench.json"), help="All figures.")
+    page: Path = setting(Path("RESULTS.md"), help="Page for the table.")
+
+    def __post_init__(self) -> None:
+        """Check the names of parts.
+
+        Raises:
+            UserError: one is unknown.
+        """
+        super().__post_init__()
+        for name in {*self.part, *self.again} - set(PARTS):
+            raise UserError(f"{name!r} is no part of the benchmarks; choose from {', '.join(PARTS)}")
+
+
+def run_script(script: str, words: list[str]) -> None:
+    """Run a benchmark's command in this process.
+
+    Raises:
+        UserError: it failed.
+    """
+    try:
+        importlib.import_module(f"graspq.benchmarks.{script}").main.main(words, prog_name=script)
+    except SystemExit as ended:
+        if ended.code:
+            raise UserError(f"{script}: ended with status {ended.code}; its words are above, nothing is kept") from None
+
+
+def measured(name: str, words: list[str], work: Path, again: bool) -> dict[str, Any]:
+    """Return what a part found, after running it if that is not there yet."""
+    path, fresh = work / f"{name}.json", work / f"{name}.fresh.json"
+    if again:
+        shutil.rmtree(work / name, ignore_errors=True)  # what it went on from
+    if again or not path.exists():
+        click.echo(f"\n== {name}: python benchmarks/{words[0]}.py {' '.join(words[1:])}", err=True)
+        for _ in apart([Call(run_script, (words[0], [*words[1:], "--out", str(fresh)]))]):
+            fresh.replace(path)
+    found: dict[str, Any] = read_json(path, "benchmark's figures")
+    return found
+
+
+def page_section(found: Mapping[str, Mapping[str, Any]], commands: Mapping[str, str], facts: str) -> str:
+    """Return what the page shows: the ratios, each part's first with its command, and where the time goes."""
+    rows: list[list[str]] = []
+    for name, part in found.items():
+        lines = [Ratio(**ratio).row() for ratio in part["ratios"]]
+        rows += [[*line, f"`{commands[name]}`" if line is lines[0] else ""] for line in lines]
+    text = markdown(("in one run", "measured", "bar", "aim", "met", "command"), rows) + f"\n{facts}\n"
+    for part in found.values():
+        for title, shown in part["tables"].items():
+            text += f"\n### {title}\n\n{table(shown)}" if title in PUBLISHED_TABLES else ""
+    return text
 
 
 def with_section(text: str, between: str) -> str:
@@ -69,29 +112,7 @@ def with_section(text: str, between: str) -> str:
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise UserError(f"the page for the table lacks the lines {BEGIN} and {END}")
-    return f"{before}{BEGIN}\n\n{between}\n\n{END}{after}"
-
-
-def measured(name: str, words: list[str], work: Path, again: bool) -> Found:
-    """Return what a part wrote, after running it if that is not there yet.
-
-    Raises:
-        UserError: it failed.
-    """
-    path = work / f"{name}.json"
-    if again or not path.exists():
-        if again:
-            shutil.rmtree(work / name, ignore_errors=True)  # what it went on from
-        click.echo(f"\n== {name}: python {' '.join(words)}", err=True)
-        fresh = work / f"{name}.fresh.json"
-        done = subprocess.run(
-            [sys.executable, str(FOLDER.parent / words[0]), *words[1:], "--out", str(fresh)], check=False
-        )
-        if done.returncode != 0:
-            raise UserError(f"{name}: ended with status {done.returncode}; its words are above, nothing of it was kept")
-        fresh.replace(path)
-    result: Found = read_json(path, "benchmark's figures")
-    return result
+    return f"{before}{BEGIN}\n\n{between}\n{END}{after}"
 
 
 def processor() -> str:
@@ -104,50 +125,25 @@ def processor() -> str:
 
 
 @click.command(cls=Command)
-@click.option("--shards", default="data/regular-10k", show_default=True, help="Dataset folder.")
-@click.option("--run", default="runs/mc-regular-10k-seed0", show_default=True, help="Run that is evaluated.")
-@click.option(
-    "--work",
-    type=click.Path(path_type=Path),
-    default=Path("runs/bench"),
-    show_default=True,
-    help="Folder of the parts' figures.",
-)
-@click.option(
-    "--part", "parts", type=click.Choice(list(PARTS)), multiple=True, help="What to measure; all if not given."
-)
-@click.option("--again", type=click.Choice(list(PARTS)), multiple=True, help="Measure this part anew; may be repeated.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("results/bench.json"), show_default=True, help="All figures."
-)
-@click.option(
-    "--page",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    default=Path("RESULTS.md"),
-    show_default=True,
-    help="Page for the table.",
-)
-def main(
-    shards: str, run: str, work: Path, parts: tuple[str, ...], again: tuple[str, ...], out: Path, page: Path
-) -> None:
+@options_from(BenchSettings)
+def main(settings: BenchSettings) -> None:
     """Run the benchmarks that are not done yet, and write their figures and the table of ratios."""
-    work.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Found] = {}
+    settings.work.mkdir(parents=True, exist_ok=True)
+    published = read_json(settings.out, "benchmarks' figures")["parts"] if settings.out.exists() else {}
+    found: dict[str, dict[str, Any]] = {}
     commands: dict[str, str] = {}
-    for name, part in PARTS.items():
-        words = part.words(shards=shards, run=run, own=(work / name).as_posix())
-        commands[name] = f"python {' '.join(words)}"
-        if not parts or name in (*parts, *again) or (work / f"{name}.json").exists():
-            found[name] = measured(name, words, work, name in again)
-    lines = table(ratio_rows(found, commands))
-    facts = {"processor": processor(), "cores": available_cores()}
-    write_json(out, {**facts, "commands": commands, "parts": found})
-    where = (
-        f"{facts['processor']}, {facts['cores']} cores. Every figure, with the day and the code of each part: "
-        f"[{out}]({out})."
-    )
-    write_text(page, with_section(page.read_text(), "\n\n".join(filter(None, [lines, where, section(found)]))))
-    click.echo(lines)
+    for name, template in PARTS.items():
+        work = (settings.work / name).as_posix()
+        words = template.format(shards=settings.shards, run=settings.run, work=work).split()
+        commands[name] = f"python benchmarks/{words[0]}.py {' '.join(words[1:])}".strip()
+        if name in (settings.part or PARTS) or name in settings.again:
+            found[name] = measured(name, words, settings.work, name in settings.again)
+        elif name in published:
+            found[name] = published[name]
+    where = f"{processor()}, {available_cores()} cores"
+    write_json(settings.out, {"machine": where, "commands": commands, "parts": found})
+    facts = f"{where}. Every figure, with the day and the code of each part: [{settings.out}]({settings.out})."
+    write_text(settings.page, with_section(settings.page.read_text(), page_section(found, commands, facts)))
 
 
 if __name__ == "__main__":

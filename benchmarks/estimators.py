@@ -8,49 +8,50 @@ targets, forward, backward and optimiser, as `grasp-train` runs them with defaul
 
 import contextlib
 import statistics
-import tempfile
-from pathlib import Path
+from dataclasses import dataclass
 
-import click
-from sessions import default_settings, ready, steps_on
-from timing import median_ratio, report, take_turns
-
-from graspq.common.options import Command
+from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, median_ratio, take_turns
+from graspq.benchmarks.sessions import ready, steps_on, training_of, update_of
+from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
 from graspq.train.estimators import ESTIMATORS
-from graspq.train.loop import session
-
-RIVAL = "mc"
 
 
-@click.command(cls=Command)
-@click.option("--shards", multiple=True, required=True, help="Dataset folders, shard files or globs.")
-@click.option("--turns", type=click.IntRange(1), default=5, show_default=True, help="Turns that are measured.")
-@click.option("--steps", type=click.IntRange(1), default=6, show_default=True, help="Steps of each in a turn.")
-@click.option("--threads", type=click.IntRange(1), default=None, help="CPU threads; torch's own choice if not given.")
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON file for the figures.")
-def main(shards: tuple[str, ...], turns: int, steps: int, threads: int | None, out: Path | None) -> None:
-    """Measure all estimators of the table."""
-    pool = open_shards(shards)
-    kept, held_back = pool.split(0.05, 0)
+@dataclass(frozen=True)
+class EstimatorsSettings(TrainingSpeedSettings):
+    """Settings of this benchmark."""
+
+    steps: int = setting(6, help="Steps of each estimator in a turn.", minimum=1)
+
+
+def measure(settings: EstimatorsSettings) -> Result:
+    """Return the speed of each estimator of the table."""
+    pool = open_shards(settings.shards)
     runs, real = {}, {}
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         for name in ESTIMATORS:
-            settings = default_settings(name, shards, Path(folder) / name, threads)
-            current = stack.enter_context(session(settings, pool, kept, held_back))
-            batches = ready(current, kept, steps)
-            runs[name], real[name] = steps_on(batches, current.update), sum(int(batch.real_steps) for batch in batches)
-        seconds = take_turns(runs, turns)
+            current = stack.enter_context(training_of(name, pool, settings))
+            batches = ready(current, pool, settings.steps)
+            runs[name] = steps_on(batches, update_of(current))
+            real[name] = sum(int(batch.real_steps.sum()) for batch in batches)
+        seconds = take_turns(runs, settings.turns)
     pace = {name: [value / real[name] for value in values] for name, values in seconds.items()}
+    times = {name: median_ratio(pace["mc"], values) for name, values in pace.items()}
     rows = [
-        {
-            "estimator": name,
-            "transitions a second": 1 / statistics.median(values),
-            f"times {RIVAL}": median_ratio(pace[RIVAL], values),
-        }
+        {"estimator": name, "transitions a second": 1 / statistics.median(values), "times mc": times[name]}
         for name, values in pace.items()
     ]
-    report("Training speed of the estimators", rows, {"steps a turn": steps, "turns": turns}, out)
+    return Result(
+        [
+            Ratio("transitions a second of `dql`, against `mc`", times["dql"], bar=0.5),
+            Ratio("… of `corr-mc`", times["corr-mc"], bar=0.4),
+        ],
+        {"Training speed of the estimators": rows},
+        {"steps a turn": settings.steps, "turns": settings.turns},
+    )
+
+
+main = command(EstimatorsSettings, measure)
 
 
 if __name__ == "__main__":

@@ -1,179 +1,148 @@
-"""Evaluation: episodes a second of `grasp-eval` against one environment at a time in as many processes.
+"""Evaluation: episodes a second of `grasp-eval` against other ways to ask the network, one environment at a time.
 
     python benchmarks/evaluation.py runs/mc-regular-10k-seed0
 
-The rivals decide for one state at a time: by the whole network on 64 tiled copies of the picture in every iteration of
-CEM, by the trunk anew in every iteration, and by the trunk once, which shows what batches alone are worth. All meet the
-same scenes and draw the same noise; `--rival-episodes` lets the slow ones stop after the first of them. Ours starts its
-simulators within the clock, as `grasp-eval` does; the rivals' are ready before it.
+The rivals play the same episodes with the same noise in as many processes, and search by the whole network on 64 tiled
+copies of the picture in every iteration of CEM, by the trunk anew in every iteration, and by the trunk once, as ours
+does. They must first give the same actions and Q. Ours starts its workers within the clock, as `grasp-eval` does; the
+rivals' clocks start when their simulator is open and a first episode is played. `--rival-episodes` lets the slow ones
+stop after the first of them.
 """
 
-import contextlib
 import statistics
-from collections.abc import Callable, Generator
+import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import click
+import numpy as np
 import torch
-from players import Player
-from rivals import WAYS, asking
-from timing import median_ratio, report, take_turns
 
+from graspq.benchmarks.measuring import (
+    BenchmarkSettings,
+    Call,
+    Ratio,
+    Result,
+    apart,
+    command,
+    greatest_difference,
+    median_ratio,
+)
+from graspq.benchmarks.rivals import ANEW, ONCE, TILED, WAYS, asking
 from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
-from graspq.common.options import Command
-from graspq.common.seeding import generator
-from graspq.evaluate.evaluation import Prepared, play, prepare, stage_of
+from graspq.common.options import setting
+from graspq.evaluate.evaluation import prepare
 from graspq.evaluate.jobs import jobs_from_settings
-from graspq.evaluate.q_policy import QPolicy
-from graspq.evaluate.rollout import POLICY_PURPOSE
+from graspq.evaluate.rollout import Rollouts, run_rollouts
 from graspq.evaluate.settings import EvalSettings
-from graspq.evaluate.workers import Stage, begin_episode
+from graspq.policies.of_run import RunPolicy
+from graspq.sim.observation import Observation
 
-OURS = "graspq"
+OURS = "graspq, start-up included"
 Successes = dict[int, bool]
 
 
-def one_at_a_time(
-    settings: EvalSettings, stage: Stage, episodes: range, threads: int
-) -> Generator[Successes | None, str, None]:
-    """A player's part: one environment, one state a decision, asked for in the way that the message names."""
-    from graspq.objects.object_set import ObjectSet
-    from graspq.sim.episode import GraspSimulation
-    from graspq.sim.task import task_from_json
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSettings(BenchmarkSettings):
+    """Settings of this benchmark."""
 
-    torch.set_num_threads(threads)
-    policy = searching(prepare(jobs_from_settings(settings)[0], settings))
-    objects = ObjectSet.load(Path(stage.objects))
-    with GraspSimulation(task_from_json(stage.task), objects) as simulation:
-        way = yield None
-        while True:
-            acting = asking(policy, way)
-            way = yield {episode: _succeeds(simulation, stage, acting, episode) for episode in episodes}
+    run: Path = setting(help="Run folder whose policy searches.", positional=True, metavar="RUN")
+    turns: int = setting(3, help="Turns that are measured.", minimum=1)
+    episodes: int = setting(128, help="Episodes in a turn.", minimum=1)
+    rival_episodes: int | None = setting(None, help="The rivals', the first of ours; all if not given.", minimum=1)
+    workers: int | None = setting(None, help="Processes; the number of cores if not given.", minimum=1)
+    split: str = setting("test", help="Split of the object set.")
+    seed: int = setting(0, help="Seed of the scenes.", minimum=0)
+    objects: Path | None = setting(None, help="Object set; the run's if not given.")
 
 
-def _succeeds(simulation: Any, stage: Stage, policy: QPolicy, episode: int) -> bool:
-    seen = begin_episode(simulation, simulation.objects, stage.split, stage.seed, episode)
-    draws, terminated, info = generator(POLICY_PURPOSE, stage.seed, episode), False, {}
-    while not terminated:
-        outcome = simulation.step(policy.act_batch(seen.image[None], [seen.step], [draws], seen.gripper_pose[None])[0])
-        seen, terminated, info = outcome.observation, outcome.terminated, outcome.info
-    return bool(info["success"])
-
-
-def searching(prepared: Prepared) -> QPolicy:
-    """Return the policy of a run.
+@torch.inference_mode()
+def check_rivals(policy: RunPolicy) -> None:
+    """Refuse rivals that find other actions or Q than ours, on pictures of noise.
 
     Raises:
-        UserError: its estimator acts by an actor network: there is no search to compare.
+        UserError: they do, or the policy has no search that could be compared.
     """
-    if not isinstance(prepared.policy, QPolicy):
-        raise UserError(f"{prepared.job.run}: acts by an actor network; name a run that searches, such as one of mc")
-    return prepared.policy
+    if not policy.searches:
+        raise UserError(f"{policy.name}: acts by an actor network; name a run that searches, such as one of mc")
+    shape = policy.origin.specification.image_shape
+    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    seen = Observation(image, 3, np.zeros(policy.acting.action.size, np.float32))
+
+    def found(acting: RunPolicy) -> torch.Tensor:
+        action = acting.act(seen, np.random.default_rng(1))
+        return torch.from_numpy(np.append(action, acting.q if acting.q is not None else np.nan))
+
+    greatest_difference(found(policy), {way: found(asking(policy, way)) for way in WAYS})
 
 
-def ours(prepared: Prepared, settings: EvalSettings, into: list[Successes]) -> Callable[[], None]:
-    """Return what runs all episodes as `grasp-eval` does and keeps their successes."""
-
-    def run() -> None:
-        rows, _ = play(prepared, settings)
-        into.append({row.episode: row.success for row in rows})
-
-    return run
-
-
-def crew(players: list[Player], way: str, into: list[Successes]) -> Callable[[], None]:
-    """Return what lets the players share all episodes and keeps their successes."""
-
-    def run() -> None:
-        for player in players:
-            player.ask(way)
-        into.append({episode: success for player in players for episode, success in player.answer().items()})
-
-    return run
+def one_at_a_time(rollouts: Rollouts, episodes: range) -> tuple[float, Successes]:
+    """Return the seconds of some episodes in this process, and their successes; the first is played once before."""
+    with rollouts.open(lambda folder: folder) as play:
+        play(episodes[:1])
+        start = time.perf_counter()
+        films = play(episodes)
+        return time.perf_counter() - start, {film.row.episode: film.row.success for film in films}
 
 
-def measure(prepared: Prepared, settings: EvalSettings, turns: int, rival_episodes: int) -> list[dict[str, Any]]:
-    """Return a row for us and one for each rival."""
-    workers, stage = settings.workers or available_cores(), stage_of(prepared)
-    found: dict[str, list[Successes]] = {OURS: [], **{f"one at a time, {way}": [] for way in WAYS}}
-    threads = max(1, available_cores() // workers)
-    with contextlib.ExitStack() as stack:
-        waiting = [
-            Player(one_at_a_time, settings, stage, range(number, rival_episodes, workers), threads)
-            for number in range(workers)
-        ]
-        players = [stack.enter_context(player) for player in waiting]
-        runs = {OURS: ours(prepared, settings, found[OURS])}
-        for way in WAYS:
-            name = f"one at a time, {way}"
-            runs[name] = crew(players, way, found[name])
-        seconds = take_turns(runs, turns)
-    pace = {name: [value / len(found[name][0]) for value in values] for name, values in seconds.items()}
-    expected = found[OURS][0]
-    return [
+def together(rollouts: Rollouts, episodes: int, workers: int) -> tuple[float, Successes]:
+    """Return the seconds of the slowest of so many processes that share the episodes, and all successes."""
+    calls = [Call(one_at_a_time, (rollouts, range(number, episodes, workers))) for number in range(workers)]
+    seconds, successes = zip(*apart(calls, at_once=workers), strict=True)
+    return max(seconds), {episode: success for part in successes for episode, success in part.items()}
+
+
+def measure(settings: EvaluationSettings) -> Result:
+    """Return episodes a second of the evaluation of RUN, and of the rivals (on the CPU)."""
+    workers = settings.workers if settings.workers is not None else available_cores()
+    given = EvalSettings(
+        runs=(str(settings.run),),
+        split=settings.split,
+        episodes=settings.episodes,
+        seed=settings.seed,
+        objects=settings.objects,
+        workers=workers,
+        device="cpu",
+    )
+    prepared = prepare(jobs_from_settings(given)[0], given)
+    assert prepared.run is not None
+    check_rivals(prepared.run)
+    theirs = min(max(settings.rival_episodes or settings.episodes, workers), settings.episodes)
+    pace: dict[str, list[float]] = {name: [] for name in (OURS, *WAYS)}
+    successes: dict[str, Successes] = {}
+    for turn in range(settings.turns):
+        start = time.perf_counter()
+        played, _ = run_rollouts(prepared.rollouts, settings.episodes, given.where)
+        pace[OURS].append((time.perf_counter() - start) / settings.episodes)
+        successes[OURS] = {row.episode: row.success for row in played}
+        for way in list(WAYS)[:: 1 if turn % 2 else -1]:
+            rollouts = Rollouts(prepared.scenes, asking(prepared.run, way))
+            seconds, successes[way] = together(rollouts, theirs, workers)
+            pace[way].append(seconds / theirs)
+    times = {name: median_ratio(values, pace[OURS]) for name, values in pace.items()}
+    rows = [
         {
             "evaluation": name,
             "episodes a second": 1 / statistics.median(values),
-            "graspq is faster, times": median_ratio(values, pace[OURS]),
-            "episodes": len(found[name][0]),
-            "successes": sum(found[name][0].values()),
-            "end as ours": sum(expected[episode] == success for episode, success in found[name][0].items()),
+            "graspq is faster, times": times[name],
+            "episodes": len(successes[name]),
+            "successes": sum(successes[name].values()),
+            "end as ours": sum(successes[OURS][episode] == one for episode, one in successes[name].items()),
         }
         for name, values in pace.items()
     ]
-
-
-@click.command(cls=Command)
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option("--episodes", type=click.IntRange(1), default=128, show_default=True, help="Episodes in a turn.")
-@click.option(
-    "--rival-episodes", type=click.IntRange(1), default=None, help="The rivals', the first of ours; all if not given."
-)
-@click.option("--turns", type=click.IntRange(1), default=3, show_default=True, help="Turns that are measured.")
-@click.option("--workers", type=click.IntRange(1), default=None, help="Processes; the number of cores if not given.")
-@click.option("--environments", type=click.IntRange(1), default=32, show_default=True, help="Ours.")
-@click.option("--split", default="test", show_default=True, help="Split of the object set.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the scenes.")
-@click.option("--objects", type=click.Path(path_type=Path), default=None, help="Object set; the run's if not given.")
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON file for the figures.")
-def main(
-    run: Path,
-    episodes: int,
-    rival_episodes: int | None,
-    turns: int,
-    workers: int | None,
-    environments: int,
-    split: str,
-    seed: int,
-    objects: Path | None,
-    out: Path | None,
-) -> None:
-    """Measure the evaluation of RUN, a folder of grasp-train whose policy searches (on the CPU)."""
-    settings = EvalSettings(
-        runs=(str(run),),
-        split=split,
-        episodes=episodes,
-        seed=seed,
-        objects=objects,
-        workers=workers or available_cores(),
-        environments=environments,
-        device="cpu",
+    return Result(
+        [
+            Ratio("episodes a second, against one at a time with tiled copies", times[TILED], bar=4, aim=8),
+            Ratio("… one at a time, trunk each iteration", times[ANEW]),
+            Ratio("… one at a time, trunk once (our network), its start not counted", times[ONCE], aim=0.95),
+        ],
+        {"Evaluation (CEM: 3 iterations of 64 samples)": rows},
+        {"run": settings.run.as_posix(), "workers of each": workers, "turns": settings.turns},
     )
-    prepared = prepare(jobs_from_settings(settings)[0], settings)
-    searching(prepared)
-    rows = measure(prepared, settings, turns, min(episodes if rival_episodes is None else rival_episodes, episodes))
-    facts = {
-        "run": run.as_posix(),
-        "workers of each": settings.workers,
-        "our environments": environments,
-        "threads of our decisions": 1,
-        "threads of each rival's process": max(1, available_cores() // (settings.workers or 1)),
-        "turns": turns,
-    }
-    report("Evaluation (CEM: 3 iterations of 64 samples)", rows, facts, out)
 
+
+main = command(EvaluationSettings, measure)
 
 if __name__ == "__main__":
     main()

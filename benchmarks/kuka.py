@@ -2,7 +2,7 @@
 
 Its code runs unchanged. It imports two packages that are no longer to be had beside ours, and takes next to nothing
 from them; the stand-ins below hold just that: from `gym` a base class, spaces and a generator, from `pkg_resources`
-the order of two version numbers.
+the order of two version numbers. It uses PyBullet's first physics client: it needs a process of its own.
 """
 
 import contextlib
@@ -11,14 +11,25 @@ import random
 import sys
 import time
 import types
-from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from tallies import Tally
+
+from graspq.policies.random import RandomPolicy
 
 MAX_STEPS = 15  # T
 IMAGE_SIZE = 64
+
+
+class Tally(NamedTuple):
+    """What a stretch of collection came to, the same for us and for the rival."""
+
+    seconds: float
+    core_seconds: float
+    grasps: int
+    actions: int
+    frames: int
+    successes: int
 
 
 def stand_ins() -> dict[str, types.ModuleType]:
@@ -27,14 +38,12 @@ def stand_ins() -> dict[str, types.ModuleType]:
     from packaging.version import parse
 
     modules = {name: types.ModuleType(name) for name in ("gym", "gym.envs", "gym.envs.registration", "pkg_resources")}
-    registration, gym = modules["gym.envs.registration"], modules["gym"]
-    registration.registry = types.SimpleNamespace(env_specs={})  # type: ignore[attr-defined]
-    for name in ("make", "spec", "register"):
-        setattr(registration, name, lambda *arguments, **settings: None)  # nobody makes an environment by name here
-    modules["gym.envs"].registration = registration  # type: ignore[attr-defined]
-    gym.__version__, gym.Env = "0.26.2", object  # type: ignore[attr-defined]
-    gym.spaces, gym.utils, gym.envs = gymnasium.spaces, gymnasium.utils, modules["gym.envs"]  # type: ignore[attr-defined]
-    modules["pkg_resources"].parse_version = parse  # type: ignore[attr-defined]
+    nothing = dict.fromkeys(("make", "spec", "register"), lambda *given, **more: None)
+    vars(modules["gym.envs.registration"]).update(registry=types.SimpleNamespace(env_specs={}), **nothing)
+    vars(modules["gym.envs"]).update(registration=modules["gym.envs.registration"])
+    shared = {"spaces": gymnasium.spaces, "utils": gymnasium.utils, "envs": modules["gym.envs"]}
+    vars(modules["gym"]).update(__version__="0.26.2", Env=object, **shared)
+    vars(modules["pkg_resources"]).update(parse_version=parse)
     parts = {"gym.spaces": gymnasium.spaces, "gym.utils": gymnasium.utils, "gym.utils.seeding": gymnasium.utils.seeding}
     return modules | parts
 
@@ -57,22 +66,21 @@ def make_environment() -> Any:
         )
 
 
-def collecting(seed: int, grasps: int) -> Iterator[Tally | None]:
-    """A player's part: `grasps` random grasps at a time, every frame kept as uint8, nothing written."""
-    from graspq.policies.random import RandomPolicy
-
+def kuka_grasps(seed: int, grasps: int) -> Tally:
+    """Return what `grasps` random grasps came to, after one that is not counted: frames are kept, nothing written."""
     # Its two sources of randomness are global.
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
     draws, policy, environment = np.random.default_rng(seed), RandomPolicy(), make_environment()
-    yield None
-    while True:
-        start, actions, successes = time.process_time(), 0, 0
-        for _ in range(grasps):
-            frames, done, debug = [np.asarray(environment.reset(), dtype=np.uint8)], False, {}
-            while not done:
-                image, _, done, debug = environment.step(policy.act(None, draws))
-                frames.append(np.asarray(image, dtype=np.uint8))
-            actions += len(frames) - 1
-            successes += int(debug["grasp_success"] > 0)
-        yield Tally(time.process_time() - start, grasps, actions, actions + grasps, successes)
+    start, core_start, actions, successes = 0.0, 0.0, 0, 0
+    for grasp in range(grasps + 1):
+        if grasp == 1:
+            start, core_start, actions, successes = time.perf_counter(), time.process_time(), 0, 0
+        frames, done, debug = [np.asarray(environment.reset(), dtype=np.uint8)], False, {}
+        while not done:
+            image, _, done, debug = environment.step(policy.act(None, draws))
+            frames.append(np.asarray(image, dtype=np.uint8))
+        actions += len(frames) - 1
+        successes += int(debug["grasp_success"] > 0)
+    seconds, core_seconds = time.perf_counter() - start, time.process_time() - core_start
+    return Tally(seconds, core_seconds, grasps, actions, actions + grasps, successes)

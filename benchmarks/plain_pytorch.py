@@ -1,20 +1,20 @@
 """The default network and its training step as one writes them plainly in PyTorch: the rival of `training.py`.
 
-float32, images in NCHW, no compilation, no fused optimiser, one image after the other in augmentation. Candidate
-actions share their picture's part of Q, or have a copy of it each (`tiled`). It computes what `graspq.train` computes,
-and `training.py` checks that at each run.
-Dimensions: B batch, N candidates, A action, H W C image.
+float32, images in NCHW, no fused optimiser, one image after the other in augmentation. `training.py` checks at each run
+that it computes what `graspq.train` computes. Dimensions: B batch, N candidates, A action, H W C image.
 """
 
 import copy
 import random
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from graspq.train.networks import QNetwork
+from graspq.train.estimators.dql import DqlSettings
+from graspq.train.networks.network import QNetwork
+from graspq.train.settings import TrainSettings
 
 
 class ConvNorm(nn.Module):
@@ -27,11 +27,12 @@ class ConvNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [B, C', H', W'] of [B, C, H, W]."""
-        return self.norm(self.conv(x))
+        normed: Tensor = self.norm(self.conv(x))
+        return normed
 
 
 class PlainNetwork(nn.Module):
-    """The default network for one action a picture; see `graspq/train/default_network.py` for what it is."""
+    """The default network for one action a picture; see `train/networks/default.py` for what it is."""
 
     def __init__(self, last_step: int, actions: int = 4) -> None:
         super().__init__()
@@ -92,7 +93,8 @@ class PlainNetwork(nn.Module):
         looks = looks.permute(0, 2, 3, 1).flatten(2)
         state = self.state_to_hidden(state).unsqueeze(1)
         hidden = F.relu(state + self.action_to_hidden(action) + self.looks_to_hidden(looks))
-        return self.last(F.relu(self.hidden(hidden))).squeeze(2)
+        output: Tensor = self.last(F.relu(self.hidden(hidden)))
+        return output.squeeze(2)
 
     def keypoints(self, x: Tensor) -> Tensor:
         """Return the expected place, x then y in [-1, 1], of each of 16 heat maps; float32 [B, 32]."""
@@ -136,13 +138,13 @@ def plain_copy(network: QNetwork, last_step: int) -> PlainNetwork:
 
 
 def augmented(
-    image: Tensor, action: Tensor, shifts: list[list[int]], mirrored: list[bool], margin: int
+    image: Tensor, action: Tensor, shifts: Sequence[Sequence[int]], mirrored: Sequence[bool], margin: int
 ) -> tuple[Tensor, Tensor]:
     """Return pictures padded with their border, cropped and mirrored one by one, and their actions.
 
     Args:
         image: uint8 [B, C, H, W].
-        action: float32 [B, A].
+        action: float32 [B, 4].
         shifts: rows and columns that each picture is moved by, -margin to margin.
         mirrored: which are mirrored.
         margin: pixels of padding.
@@ -161,19 +163,18 @@ def augmented(
 
 
 class PlainTraining:
-    """Plain training of `mc` or `dql` with the settings that the default preset has.
+    """Plain training of `mc`, or of `dql`, whose candidates share their picture's part of Q or have a copy each.
 
     A batch is a dictionary: `image` uint8 [B, C, H, W], `step` int64 [B], `action` float32 [B, A], `mc_return`,
     `reward` float32 [B], `terminal` bool [B], and for `dql` `next_image` and `next_step`.
     """
 
-    def __init__(
-        self, network: PlainNetwork, settings: Any, discount: float, bootstrapped: bool, tiled: bool = False
-    ) -> None:
-        self.network, self.settings, self.discount = network, settings, discount
-        self.bootstrapped, self.tiled = bootstrapped, tiled
+    def __init__(self, network: PlainNetwork, settings: TrainSettings, tiled: bool = False) -> None:
+        """Start with these weights; `tiled` gives every candidate a copy of its picture."""
+        self.network, self.settings, self.tiled = network, settings, tiled
+        self.dql = settings.own if isinstance(settings.own, DqlSettings) else None
         self.average = copy.deepcopy(network).eval()
-        self.target_network = copy.deepcopy(network).eval()
+        self.lagged = copy.deepcopy(network).eval()
         matrices = [parameter for parameter in network.parameters() if parameter.dim() > 1]
         others = [parameter for parameter in network.parameters() if parameter.dim() <= 1]
         groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
@@ -187,32 +188,31 @@ class PlainTraining:
         mirrored = [random.random() < 0.5 for _ in range(rows)]
         image, action = augmented(batch["image"], batch["action"], shifts, mirrored, margin)
         target = batch["mc_return"]
-        if self.bootstrapped:
+        if self.dql is not None:
             next_image, _ = augmented(batch["next_image"], batch["action"], shifts, mirrored, margin)
-            candidates = torch.rand(rows, self.settings.candidates, action.shape[1]) * 2 - 1
-            target = self.double_q(batch, next_image, candidates)
+            candidates = torch.rand(rows, self.dql.candidates, action.shape[1]) * 2 - 1
+            target = self.double_q(batch, next_image, candidates, self.dql.discount)
         self.network.train()
         loss = F.binary_cross_entropy_with_logits(self.network(image, batch["step"], action), target)
         self.optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.follow()
         return loss
 
     @torch.no_grad()
-    def double_q(self, batch: dict[str, Tensor], next_image: Tensor, candidates: Tensor) -> Tensor:
-        """Return r + γ Q'(s', argmax Q(s', aᵢ)) of N candidates; where `tiled`, each with a copy of its picture."""
+    def double_q(self, batch: dict[str, Tensor], next_image: Tensor, candidates: Tensor, discount: float) -> Tensor:
+        """Return r + γ Q'(s', argmax Q(s', aᵢ)) of N candidates, float32 [B, N, A]; `next_image` float32."""
         self.network.eval()
         rows, count, dimensions = candidates.shape
         if self.tiled:
-            copies = next_image.repeat_interleave(count, 0)
-            steps = batch["next_step"].repeat_interleave(count)
+            copies, steps = (x.repeat_interleave(count, 0) for x in (next_image, batch["next_step"]))
             q = self.network(copies, steps, candidates.view(-1, dimensions)).view(rows, count)
         else:
             q = self.network.of_actions(self.network.trunk(next_image, batch["next_step"]), candidates)
         best = candidates[torch.arange(rows), q.argmax(1)]
-        value = torch.sigmoid(self.target_network(next_image, batch["next_step"], best))
-        return batch["reward"] + self.discount * value * (~batch["terminal"]).float()
+        value = torch.sigmoid(self.lagged(next_image, batch["next_step"], best))
+        return batch["reward"] + discount * value * (~batch["terminal"]).float()
 
     @torch.no_grad()
     def follow(self) -> None:
@@ -225,5 +225,5 @@ class PlainTraining:
                 mean.mul_(decay).add_(learned[name] * (1 - decay))
             else:
                 mean.copy_(learned[name])
-        if self.step % self.settings.lag_steps == 0:
-            self.target_network.load_state_dict(learned)
+        if self.dql is not None and self.step % self.dql.lag_steps == 0:
+            self.lagged.load_state_dict(learned)

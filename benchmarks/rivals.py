@@ -3,14 +3,16 @@
 Dimension key: B states, N candidates, A action.
 """
 
-import copy
+import dataclasses
 from collections.abc import Callable
 
-from torch import Tensor
+from torch import Tensor, nn
 
-from graspq.evaluate.q_policy import QPolicy
-from graspq.train.networks import QNetwork
+from graspq.policies.of_run import RunPolicy
+from graspq.train.networks.network import QNetwork
 from graspq.train.selection import QOfActions
+
+Way = Callable[[QNetwork, Tensor, Tensor], QOfActions]
 
 
 def tiled(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
@@ -35,26 +37,24 @@ def once(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
     return network.at(image, step)
 
 
-WAYS: dict[str, Callable[[QNetwork, Tensor, Tensor], QOfActions]] = {
-    "64 tiled copies": tiled,
-    "trunk each iteration": anew,
-    "trunk once": once,
-}
+TILED, ANEW, ONCE = "64 tiled copies", "trunk each iteration", "trunk once"
+WAYS: dict[str, Way] = {TILED: tiled, ANEW: anew, ONCE: once}
 
 
-class _Asked:
-    """A Q-network to a policy, which asks for values in another way."""
+class Asked(nn.Module):
+    """A Q-network to a policy that searches, asked for values in one of `WAYS`."""
 
     def __init__(self, network: QNetwork, way: str) -> None:
-        self._network, self._way = network, WAYS[way]
+        super().__init__()
+        self.network, self.way = network, way
 
     def at(self, image: Tensor, step: Tensor) -> QOfActions:
         """Return Q of candidate actions in these states; see `QNetwork.at`."""
-        return self._way(self._network, image, step)
+        return WAYS[self.way](self.network, image, step)
 
 
-def asking(policy: QPolicy, way: str) -> QPolicy:
-    """Return a copy of a policy that searches the same, and asks for values in one of `WAYS`."""
-    rival = copy.copy(policy)
-    rival.network = _Asked(policy.network, way)  # type: ignore[assignment]
-    return rival
+def asking(policy: RunPolicy, way: str) -> RunPolicy:
+    """Return a policy that searches the same, and asks for values in one of `WAYS`."""
+    networks = {**policy.acting.networks, "q": Asked(policy.acting.q, way)}
+    acting = dataclasses.replace(policy.acting, networks=networks)
+    return RunPolicy(policy.origin, acting, policy.selection, policy.cem, policy.device)

@@ -1,11 +1,12 @@
 """What the runs of a report were made with: their settings side by side, commands, versions."""
 
+import dataclasses
 import shlex
 from collections.abc import Sequence
 from typing import Any
 
 from graspq.common.errors import UserError
-from graspq.common.options import flag
+from graspq.common.options import flag, shown_value
 from graspq.report.findings import Findings, RunData
 
 
@@ -41,22 +42,22 @@ def command_lines(findings: Findings) -> list[str]:
 
 
 def train_command(run: RunData) -> str:
-    """Return the command line that makes a run again; settings at their preset's values are left out."""
-    from graspq.train.settings import preset_settings
+    """Return the command line that makes a run again; settings at their default values are left out."""
+    # Imported late: it imports PyTorch.
+    from graspq.train.settings import NESTED, TrainSettings, complete
 
-    given = run.settings
     try:
-        usual = preset_settings(given["preset"], algo=given["algo"], shards=tuple(given["shards"])).to_json()
+        given = TrainSettings.from_json(run.settings)
+        usual = complete({"algo": given.algo, "shards": given.shards})
     except (KeyError, TypeError, UserError):
         return str(run.config.get("command", "grasp-train"))
-    words = ["grasp-train", "--algo", given["algo"], "--shards", *given["shards"]]
-    for name, value in given.items():
-        if name in ("algo", "shards") or (name in usual and value == usual[name]):
-            continue
-        if isinstance(value, bool):
-            words.append(flag(name) if value else f"--no-{flag(name)[2:]}")
-        elif value is not None:
-            words += [flag(name), str(value)]
+    words = ["grasp-train", "--algo", given.algo, "--shards", *given.shards]
+    for settings, defaults in ((given, usual), (given.own, usual.own), (given.network_own, usual.network_own)):
+        for field in dataclasses.fields(settings):
+            value = getattr(settings, field.name)
+            if field.name not in ("algo", "shards", *NESTED) and value != getattr(defaults, field.name, ...):
+                shown = shown_value(field, value)
+                words += [shown] if isinstance(value, bool) else [flag(field.name), shown]
     return shlex.join(words)
 
 

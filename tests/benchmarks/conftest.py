@@ -1,4 +1,4 @@
-"""The benchmarks' scripts are no package: their folder is put on the path, as Python does for a script."""
+"""Drawn data for the benchmarks of loading and training."""
 
 import sys
 from pathlib import Path
@@ -9,8 +9,7 @@ import torch
 from graspq.datasets.dataset import open_shards
 from graspq.datasets.pool import ShardPool
 
-TESTS = Path(__file__).resolve().parents[1]
-sys.path += [str(TESTS.parent / "benchmarks"), str(TESTS / "datasets")]
+sys.path.append(str(Path(__file__).resolve().parents[1] / "datasets"))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -20,10 +19,15 @@ def one_thread() -> None:
 
 
 @pytest.fixture(scope="session")
-def pool(tmp_path_factory: pytest.TempPathFactory) -> ShardPool:
+def shards(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Sixty drawn episodes in three shards."""
     from drawn_data import make_dataset
 
     folder = tmp_path_factory.mktemp("data") / "drawn"
     make_dataset(folder, blocks=30, per_shard=10)
-    return open_shards([folder])
+    return str(folder)
+
+
+@pytest.fixture(scope="session")
+def pool(shards: str) -> ShardPool:
+    return open_shards([shards])

@@ -1,90 +1,72 @@
 """The command that runs all benchmarks, and the table of ratios that it writes."""
 
+import importlib
 import json
 from pathlib import Path
+from typing import Any
 
-import bench
 import pytest
-from click.testing import CliRunner
-from ratios import RATIOS, ratio_rows, row_where
 
+from graspq.benchmarks import bench
+from graspq.benchmarks.measuring import Ratio
 from graspq.common.errors import UserError
 
-FOUND = {
-    "decision": {
-        "rows": [
-            {"batch": 1, "decision": "cem, trunk once", "times of trunk once": 1.0},
-            {"batch": 1, "decision": "cem, 64 tiled copies", "times of trunk once": 30.0},
-        ]
-    },
-    "time_to_quality": {"the paper's time over ours, median": "at least 20"},
-    "estimators": {
-        "rows": [{"estimator": "dql", "times mc": 0.6}, {"estimator": "corr-mc", "times mc": 0.39}],
-    },
-}
+
+def figures(value: float) -> dict[str, Any]:
+    return {"ratios": [Ratio("x against y", value, bar=4)._asdict(), Ratio("… z", 2.0)._asdict()], "tables": {}}
 
 
-def test_the_table_has_a_line_for_each_ratio_that_was_measured_and_says_what_missed_its_bar() -> None:
-    rows = ratio_rows(FOUND, dict.fromkeys(bench.PARTS, "python benchmarks/x.py"))
-    assert len(rows) == len(RATIOS)
-    assert {row["met"] for row in rows if row["measured"] == "not measured"} == {""}
-    assert [(row["measured"], row["bar"], row["met"]) for row in rows if row["measured"] != "not measured"] == [
-        (0.6, "≥ 0.5", "yes"),
-        (0.39, "≥ 0.4", "**no**"),
-        (30.0, "≥ 4", "yes"),
-        ("at least 20", "≥ 5", "yes"),
-    ]
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "page.md").write_text(f"before\n{bench.BEGIN}\nold\n{bench.END}\nafter\n")
+    (tmp_path / "work").mkdir()
+    published = {"decision": figures(20.0), "estimators": figures(5.0)}
+    (tmp_path / "bench.json").write_text(json.dumps({"parts": published}))
+    return tmp_path
 
 
-def test_shares_are_shown_in_percent_and_must_stay_below_their_bar() -> None:
-    waiting = [{"estimator": "mc", "share of waiting": 0.051}, {"estimator": "dql", "share of waiting": 0.012}]
-    waiting = [row | {"times a step on ready batches": 1.05} for row in waiting]
-    loaders = ["graspq, streaming", "graspq, streaming, SHA-256 of all files first"]
-    loaders += ["graspq, all in the buffer, first epoch", "LeRobot-style random access"]
-    loaders += ["Hugging Face datasets, map-style", "Hugging Face datasets, streaming"]
-    found = {
-        "rows": [{"loader": name, "times PNG files": 12.0} for name in loaders],
-        "waiting for data in training": waiting,
-    }
-    memory = {"rows": [{"growth": 0.004}]}
-    rows = ratio_rows({"loading": found, "streaming_memory": memory}, dict.fromkeys(bench.PARTS, "c"))
-    shares = [(row["measured"], row["met"]) for row in rows if "%" in str(row["measured"])]
-    assert shares == [("5.1%", "**no**"), ("1.2%", "yes"), ("0.4%", "yes")]
+def run(place: Path, *more: str) -> int:
+    given = ["--work", str(place / "work"), "--out", str(place / "bench.json"), "--page", str(place / "page.md")]
+    with pytest.raises(SystemExit) as ended:
+        bench.main.main([*given, *more], prog_name="bench")
+    return int(ended.value.code or 0)
 
 
-def test_every_ratio_belongs_to_a_part_and_every_part_is_a_script() -> None:
-    assert {ratio.part for ratio in RATIOS} <= set(bench.PARTS)
-    for part in bench.PARTS.values():
-        words = part.words(shards="s", run="r", own="w")
-        assert (Path(bench.FOLDER).parent / words[0]).is_file() and not any("{" in word for word in words)
+def test_every_part_is_a_script_that_takes_its_options(capsys: pytest.CaptureFixture[str]) -> None:
+    for template in bench.PARTS.values():
+        script, *words = template.format(shards="s", run="r", work="w").split()
+        main = importlib.import_module(f"graspq.benchmarks.{script}").main
+        options = {name for parameter in main.params for name in parameter.opts}
+        assert {word for word in words if word.startswith("--")} <= options | {"--out"}
 
 
-def test_a_row_that_is_not_there_is_one_clear_line() -> None:
-    with pytest.raises(UserError, match="again"):
-        row_where(FOUND["decision"]["rows"], batch=32)
+def test_a_finished_part_is_not_run_again_and_one_that_is_not_asked_for_stays_as_published(place: Path) -> None:
+    (place / "work" / "decision.json").write_text(json.dumps(figures(30.0)))
+    assert run(place, "--part", "decision") == 0
+    parts = json.loads((place / "bench.json").read_text())["parts"]
+    assert parts == {"estimators": figures(5.0), "decision": figures(30.0)}
+    text = (place / "page.md").read_text()
+    assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
+    assert "| x against y | 30 | ≥ 4 |  | yes | `python benchmarks/decision.py` |" in text
+    assert text.count("`python benchmarks/decision.py`") == 1, "the command stands at a part's first line alone"
 
 
-def test_a_finished_part_is_not_run_again_and_a_failed_one_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_part_that_fails_leaves_what_was_measured_but_nothing_that_it_would_go_on_from(
+    place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page, out, work = tmp_path / "page.md", tmp_path / "bench.json", tmp_path / "work"
-    page.write_text(f"before\n{bench.BEGIN}\nold\n{bench.END}\nafter\n")
-    work.mkdir()
-    (work / "decision.json").write_text(json.dumps(FOUND["decision"]))
-    (work / "decision").mkdir()
-    (work / "decision" / "half").touch()
-    given = ["--work", str(work), "--out", str(out), "--page", str(page)]
-    done = CliRunner().invoke(bench.main, [*given, "--part", "decision"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(out.read_text())["parts"] == {"decision": FOUND["decision"]}
-    text = page.read_text()
-    assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text and "| 30 |" in text
-    # Measured again, by a command that fails: what was measured before stays, but nothing that it would go on from.
-    monkeypatch.setitem(bench.PARTS, "decision", bench.Part("decision", ("--turns", "0")))
-    failed = CliRunner().invoke(bench.main, [*given, "--part", "decision", "--again", "decision"])
-    assert failed.exit_code == 2
-    assert [path.name for path in work.iterdir()] == ["decision.json"]
-    assert page.read_text() == text
+    (place / "work" / "decision").mkdir()
+    (place / "work" / "decision" / "half").touch()
+    (place / "work" / "decision.json").write_text(json.dumps(figures(30.0)))
+    text = (place / "page.md").read_text()
+    monkeypatch.setitem(bench.PARTS, "decision", "decision --turns 0")
+    assert run(place, "--part", "decision", "--again", "decision") == 2
+    assert [path.name for path in (place / "work").iterdir()] == ["decision.json"]
+    assert (place / "page.md").read_text() == text
+
+
+def test_a_part_that_does_not_exist_is_one_clear_line(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(place, "--part", "speed") == 2
+    assert "'speed' is no part of the benchmarks" in capsys.readouterr().err
 
 
 def test_a_page_without_marks_is_refused() -> None:

@@ -1,6 +1,10 @@
-import pytest
-from time_to_quality import Clock, Mark, first_reached, next_validation, row_of
+"""Time to quality: when is validated, what counts as met, and trainings that are over are not run again."""
 
+import json
+
+import pytest
+
+from graspq.benchmarks.time_to_quality import QualitySettings, measure, next_validation
 from graspq.common.errors import UserError
 
 
@@ -10,33 +14,19 @@ def test_validations_come_every_so_many_transitions_and_later_every_two_per_cent
     assert next_validation(100_000, 32, 6400) == 102_000
 
 
-def test_the_bar_is_met_by_the_first_validation_that_is_good_enough():
-    marks = [Mark(1, 1.0, 1.0, 0.7), Mark(2, 2.0, 2.0, 0.75), Mark(3, 3.0, 3.0, 0.8)]
-    assert first_reached(marks, 0.75) == marks[1]
-    assert first_reached(marks, 0.81) is None
+def mark(seconds, auc):
+    return json.dumps({"step": 9, "transitions": 99, "seconds": seconds, "cpu_seconds": seconds, "auc": auc}) + "\n"
 
 
-def test_a_clock_goes_on_from_the_validation_that_its_run_is_at(tmp_path):
-    path = tmp_path / "run" / "clock.jsonl"
-    clock = Clock(path, 0)
-    for step in (10, 20):
-        clock.start()
-        clock.stop()
-        clock.note(step, 0.5 + step / 100)
-    resumed = Clock(path, 10)
-    assert resumed.marks == clock.marks[:1]
-    assert resumed.seconds == clock.marks[0].seconds > 0
-    assert Clock(path, 10).marks == resumed.marks
+@pytest.mark.parametrize(("auc", "expected"), [(0.8, 6.0), (0.7, "at least 20")])
+def test_a_rival_that_never_met_the_bar_counts_as_the_limit(shards, tmp_path, auc, expected):
+    (tmp_path / "default-seed0.jsonl").write_text(mark(5.0, 0.6) + mark(10.0, 0.76))
+    (tmp_path / "paper-seed0.jsonl").write_text(mark(60.0, auc))
+    result = measure(QualitySettings(shards=(shards,), work=tmp_path))
+    assert result.ratios[0].value == expected
 
 
-def test_a_run_without_its_times_is_refused(tmp_path):
-    with pytest.raises(UserError, match="no time of step 10"):
-        Clock(tmp_path / "clock.jsonl", 10)
-
-
-def test_a_rival_that_never_met_the_bar_is_shown_as_more_than_its_time():
-    ours = Mark(25, 3.0, 5.0, 0.76)
-    row = row_of("paper", 0, 32, 60.0, ours)
-    assert row["times ours"] == "> 20"
-    assert row["seconds"] == "> 60"
-    assert row_of("default", 0, 256, ours, ours)["times ours"] == 1.0
+def test_the_default_settings_must_meet_the_bar(shards, tmp_path):
+    (tmp_path / "default-seed0.jsonl").write_text(mark(5.0, 0.6))
+    with pytest.raises(UserError, match="ended below"):
+        measure(QualitySettings(shards=(shards,), work=tmp_path))

@@ -18,15 +18,15 @@ def run_folder(
 ) -> Path:
     """A run of `mc` with the paper's network, with two validations and two checkpoints."""
     from graspq.train.loop import train
-    from graspq.train.settings import preset_settings
+    from graspq.train.settings import complete
 
     dataset = collect_regular(tmp_path_factory.mktemp("data") / "regular", regular_objects, 4, 3)
     folder = tmp_path_factory.mktemp("runs") / "mc"
-    settings = preset_settings(
-        "paper", algo="mc", shards=(str(dataset),), out=folder, steps=4, batch_size=8, log_every=1,
-        validate_every=2, checkpoint_every=2, validation_fraction=0.25, device="cpu", precision="float32", threads=1,
-    )  # fmt: skip
-    train(settings)
+    given = {
+        "algo": "mc", "shards": (str(dataset),), "out": folder, "steps": 4, "batch_size": 8, "save_every": 2,
+        "validation_fraction": 0.25, "device": "cpu", "threads": 1,
+    }  # fmt: skip
+    train(complete(given, "paper"))
     return folder
 
 
