@@ -213,11 +213,6 @@ def measure(settings: CollectionBenchmarkSettings) -> Result:
             "Scaling over workers": scaling,
             "Where a grasp's time goes": profile,
         },
-        {
-            "turns": settings.turns,
-            "grasps a turn": settings.blocks * BLOCK,
-            "the rival's grasps a turn": settings.rival_grasps,
-        },
     )
 
 

@@ -177,9 +177,7 @@ def measure(settings: DecisionSettings) -> Result:
         [Ratio("a CEM decision, against 64 tiled copies in each iteration", tiled, bar=4)],
         {"Decisions of a policy": rows, "Q of N candidates for a state, trunk once": costs},
         {
-            "network": settings.network,
             "threads": torch.get_num_threads(),
-            "turns": settings.turns,
             "greatest difference of Q": difference,
             "standard deviation of Q over candidates, least of all states": deviation,
         },

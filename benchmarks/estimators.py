@@ -47,7 +47,6 @@ def measure(settings: EstimatorsSettings) -> Result:
             Ratio("… of `corr-mc`", times["corr-mc"], bar=0.4),
         ],
         {"Training speed of the estimators": rows},
-        {"steps a turn": settings.steps, "turns": settings.turns},
     )
 
 

@@ -138,7 +138,7 @@ def measure(settings: EvaluationSettings) -> Result:
             Ratio("… one at a time, trunk once (our network), its start not counted", times[ONCE], aim=0.95),
         ],
         {"Evaluation (CEM: 3 iterations of 64 samples)": rows},
-        {"run": settings.run.as_posix(), "workers of each": workers, "turns": settings.turns},
+        {"workers of each": workers},
     )
 
 

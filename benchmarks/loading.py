@@ -168,7 +168,7 @@ def measure(settings: LoadingSettings) -> Result:
             Ratio("LeRobot-style random access", times.get("LeRobot-style random access")),
         ],
         {"Loading shuffled transitions with s' from disk": rows},
-        {"batch size": size, "workers of each rival": settings.workers, "streaming buffer, bytes": buffer_bytes},
+        {"streaming buffer, bytes": buffer_bytes},
     )
 
 

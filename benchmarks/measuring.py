@@ -94,22 +94,23 @@ class Result:
     tables: Mapping[str, Sequence[Row]]
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as plain JSON values, with the day and the code of the measurement."""
+    def to_json(self, settings: BenchmarkSettings) -> dict[str, Any]:
+        """Return it as plain JSON values, with the settings, the day and the code of the measurement."""
         day = datetime.datetime.now(datetime.UTC).date().isoformat()
         measured = {"on": day, "code_revision": code_revision(), "versions": versions(*PACKAGES)}
         ratios = [ratio._asdict() for ratio in self.ratios]
-        return {"ratios": ratios, "tables": dict(self.tables), **self.facts, "measured": measured}
+        given = {name: value for name, value in settings.to_json().items() if name != "out"}
+        return {"ratios": ratios, "tables": dict(self.tables), **self.facts, "settings": given, "measured": measured}
 
-    def publish(self, out: Path | None) -> None:
-        """Print it, and write it as JSON where `out` is given."""
+    def publish(self, settings: BenchmarkSettings) -> None:
+        """Print it, and write it as JSON where the settings say."""
         for title, rows in self.tables.items():
             print(f"{title}\n{table(rows)}")
         for name, value in self.facts.items():
             print(f"{name}: {shown(value)}")
         print(f"\n{markdown(('in one run', 'measured', 'bar', 'aim', 'met'), [one.row() for one in self.ratios])}")
-        if out is not None:
-            write_json(out, self.to_json())
+        if settings.out is not None:
+            write_json(settings.out, self.to_json(settings))
 
 
 def command(kind: type[B], measure: Callable[[B], Result]) -> click.Command:
@@ -118,7 +119,7 @@ def command(kind: type[B], measure: Callable[[B], Result]) -> click.Command:
     @click.command(cls=Command, help=measure.__doc__)
     @options_from(kind)
     def main(settings: B) -> None:
-        measure(settings).publish(settings.out)
+        measure(settings).publish(settings)
 
     return main
 

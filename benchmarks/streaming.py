@@ -119,7 +119,6 @@ def measure(settings: StreamingSettings) -> Result:
             ),
         ],
         {"Waiting for data in training": list(rows.values()), "Resident memory of streaming `mc`": [memory]},
-        {"turns": settings.turns, "steps a turn": settings.steps},
     )
 
 

@@ -115,7 +115,6 @@ def measure(settings: QualitySettings) -> Result:
     return Result(
         [Ratio(says, ratio, bar=5, aim=15)],
         {"Time to quality of mc": rows},
-        {"bar, ROC AUC of last steps": settings.auc, "limit, times ours": settings.limit},
     )
 
 

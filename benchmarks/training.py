@@ -193,12 +193,7 @@ def measure(settings: TrainingSettings) -> Result:
             Ratio("… of `ddpg`, against d3rlpy's own, smaller network", times.get(("ddpg", D3RLPY))),
         ],
         {"Training speed on a CPU": rows, "Where a training step's time goes": pieces},
-        {
-            "steps a turn": settings.steps,
-            "turns": settings.turns,
-            "threads": torch.get_num_threads(),
-            "our precision": precision,
-        },
+        {"threads": torch.get_num_threads(), "our precision": precision},
     )
 
 
