@@ -169,8 +169,7 @@ class _OrNone(click.ParamType):  # type: ignore[type-arg]
     """A click type with a word that stands for None."""
 
     def __init__(self, kind: Any, word: str) -> None:
-        self.kind, self.word = kind, word
-        self.name = f"{kind.name}|{word}"
+        self.kind, self.word, self.name = kind, word, kind.name
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         return None if value == self.word else self.kind.convert(value, param, ctx)
@@ -236,7 +235,7 @@ def _parameter(field: Any, hint: Any, shown: str | None) -> click.Parameter:
     required = field.default is dataclasses.MISSING
     kind = _Parsed(parse, field.name) if parse is not None else _click_type(inner)
     if field.metadata["none"] is not None:
-        kind = _OrNone(kind, field.metadata["none"])
+        kind, metavar = _OrNone(kind, field.metadata["none"]), f"{kind.name.upper()}|{field.metadata['none']}"
     if field.metadata["positional"]:
         return click.Argument([field.name], type=kind, nargs=-1 if several else 1, required=required, metavar=metavar)
     text = field.metadata["help"] if shown is None else f"{field.metadata['help']} [{shown}]"

@@ -22,6 +22,8 @@ from graspq.train.settings import (
     unknown_option,
 )
 
+# Common options that stand before `--preset`: what is trained, on what, where to.
+FIRST = 4
 PRESET = click.Option(
     ["--preset"],
     type=click.Choice(["default", "paper"]),
@@ -56,12 +58,13 @@ class TrainingCommand(Command):
         """Return the parameters in groups: name of the group, its parameters."""
         algo, network = _chosen(ctx.meta.get("words", []))
         row = estimator_named(algo) if algo is not None else None
-        common = [*self.params, *common_parameters(row), PRESET, self.get_help_option(ctx)]
-        found = [("Options", [one for one in common if one is not None])]
+        found = common_parameters(row)
+        common = [*self.params, *found[:FIRST], PRESET, *found[FIRST:], self.get_help_option(ctx)]
+        groups = [("Options", [one for one in common if one is not None])]
         if row is not None:
-            found += [(f"Options of --algo {algo}", own_parameters(row))]
-            found += [(f"Options of --network {network}", network_parameters(network))]
-        return found
+            groups += [(f"Options of --algo {algo}", own_parameters(row))]
+            groups += [(f"Options of --network {network}", network_parameters(network))]
+        return groups
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the groups of options, one after the other."""

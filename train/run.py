@@ -79,7 +79,7 @@ class Run:
         return run
 
     def _refuse_other(self, config: dict[str, Any], free: frozenset[str]) -> None:
-        ours, theirs = self.config["settings"], config["settings"]
+        ours, theirs = (_flat(one["settings"]) for one in (self.config, config))
         for name in sorted((ours.keys() | theirs.keys()) - free):
             if ours.get(name) != theirs.get(name):
                 raise UserError(
@@ -171,3 +171,11 @@ class Run:
         rows = [row for row in self.metrics() if row["step"] <= step]
         if self.metrics_file.exists():
             write_text(self.metrics_file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings with those of the estimator and of the networks beside the common ones."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= value if isinstance(value, dict) else {name: value}
+    return flat

@@ -33,7 +33,7 @@ class TrainSettings(Recipe):
     `own` are the options of the estimator, `network_own` those of the networks.
     """
 
-    algo: str = setting(help="Estimator; see above.", metavar="NAME")
+    algo: str = setting(help="Estimator, see below, or module:row of your own.", metavar="NAME")
     shards: tuple[str, ...] = setting(help="Dataset folders, shard files or globs; several may follow.")
     out: Path | None = setting(None, help="Run folder; runs/ALGO-DATASET-seedSEED where it is not given.")
     seed: int = setting(0, help="Seed of weights, sample order, augmentation and candidates.", minimum=0)
