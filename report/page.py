@@ -131,11 +131,12 @@ def _selection(findings: Findings, scores: Sequence[Score]) -> str:
     """Return on which split the best was selected, and from how many; empty where there was nothing to choose."""
     best = _best(scores)
     candidates = [score for score in scores if not score.is_reference]
-    tried = sum(len(sweep.rows) for sweep in findings.sweeps)
+    places = {parent for score in candidates for one in score.evaluations for parent in one.folder.resolve().parents}
+    tried = sum(len(sweep.rows) for sweep in findings.sweeps if sweep.folder.resolve() in places)
     if best is None or (len(candidates) < 2 and tried < 2):
         return ""
     split = best.evaluations[0].summary["split"]
-    swept = f", themselves the best of {counted(tried, 'job')} of a sweep" if tried else ""
+    swept = f", among them the best of {counted(tried, 'job')} of a sweep" if tried else ""
     return (
         f"Best of {counted(len(candidates), 'candidate')}{swept}: selected by success on these very scenes of the "
         f"{split} split, so its rate and interval are flattered. A claim on unseen objects needs a selection on others."
@@ -150,7 +151,7 @@ def _cards(findings: Findings, scores: Sequence[Score]) -> list[dict[str, str]]:
         ("Scripted oracle", _reference(scores, ORACLE)),
     ):
         if score is not None:
-            detail = f"95 % interval {interval_text(*score.interval)}"
+            detail = f"95 %: {interval_text(*score.interval)}"
             cards.append({"name": name, "number": percent(score.rate), "detail": detail})
     episodes = sum(int(one.summary["episodes"]) for one in findings.evaluations)
     if episodes > 0:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from graspq.common.errors import UserError
+from graspq.evaluate.records import write_summary
 from graspq.report.charts import PLOT
 from graspq.report.findings import gather
 from graspq.report.page import render
@@ -81,6 +82,25 @@ def test_a_page_on_a_sweep_shows_the_figure_and_of_its_runs_the_best_of_each_est
     assert '<section id="stability">' in page and "5 of 6 jobs finished" in page
     assert "sweep: success of every run, sorted" in page
     assert '<section id="stability">' not in render(gather([run_folder], None))
+
+
+def test_a_page_says_that_its_best_was_selected_among_the_jobs_of_a_sweep(sweep: Sweep, tmp_path: Path) -> None:
+    job = sweep.folder / "runs" / "dql-1" / "evaluations" / "e"
+    other = tmp_path / "other"
+    for folder in (job, other):
+        folder.mkdir(parents=True)
+        write_summary(
+            folder,
+            {
+                "format_version": 1, "label": folder.name, "task": "regular", "split": "validation", "episodes": 4,
+                "successes": 3, "success_rate": 0.75, "ci95": [0.3, 0.95], "mean_steps": 4.0, "policy": "cem",
+                "seed": 0, "job": {},
+            },
+        )  # fmt: skip
+    assert "selected by" not in render(gather([other], None))
+    assert "among them the best of 6 jobs of a sweep: selected by success on these very scenes of the validation" in (
+        render(gather([sweep.folder], None))
+    )
 
 
 def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
