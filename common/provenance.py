@@ -22,8 +22,12 @@ def versions(*packages: str) -> dict[str, str]:
 
 @functools.cache
 def code_revision() -> str:
-    """Return the git commit of the source tree, with `+changes` when it differs from it, or `unknown` outside git."""
-    root = Path(__file__).resolve().parent.parent
+    """Return the revision of this code; see `revision_of`."""
+    return revision_of(Path(__file__).resolve().parent.parent)
+
+
+def revision_of(root: Path) -> str:
+    """Return the git commit of a source tree, with `+changes` when it differs from it, or `unknown` outside git."""
     if not (root / ".git").exists():
         return "unknown"
     try:
