@@ -77,7 +77,8 @@ def collected(
     collection: Collection, blocks: Iterable[Block], engine: EngineSettings
 ) -> Generator[tuple[Block, list[Episode]], None, None]:
     """Yield each block with its episodes, in any order; see `graspq.engine.run`."""
-    return run(collection, blocks, engine, units_per_worker=BLOCKS_PER_WORKER)
+    modules = [__name__] if collection.policy is None else [__name__, "graspq.policies.of_run"]
+    return run(collection, blocks, engine, units_per_worker=BLOCKS_PER_WORKER, modules=modules)
 
 
 def collect_block(

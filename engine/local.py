@@ -1,27 +1,44 @@
 """Workers as processes of this machine: each an executor of one process, so that a death is that of one unit.
 
-They are spawned, not forked: a fork would copy the locks of threads and the parent's physics clients.
+They are forked, but not from this process, whose threads' locks and physics clients they would copy: a server without
+threads, which has imported what they need, forks them at once.
 """
 
-import atexit
 import concurrent.futures
 import contextlib
 import multiprocessing
+import multiprocessing.forkserver
+import multiprocessing.util
 import os
 import pickle
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+from graspq.engine import server
 from graspq.engine.work import Bench, Died, Failed, Outcome
 
 _bench: Bench | None = None
+
+
+def warm_up(modules: Sequence[str]) -> None:
+    """Start the server that workers are forked from, and have it import modules meanwhile; returns at once.
+
+    It ends with this process. Once it runs, this does nothing.
+    """
+    multiprocessing.set_forkserver_preload([server.__name__, *modules])
+    os.environ[server.FOLDER] = multiprocessing.util.get_temp_dir()
+    try:
+        with _interrupts_blocked():
+            multiprocessing.forkserver.ensure_running()
+    finally:
+        del os.environ[server.FOLDER]
 
 
 class LocalWorker:
@@ -31,12 +48,17 @@ class LocalWorker:
 
     def __init__(self, work: bytes) -> None:
         """Start it; it opens the pickled work with its first unit."""
-        context = multiprocessing.get_context("spawn")
-        self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(work,))
+        context = multiprocessing.get_context("forkserver")
+        # The server has the environment of its own start.
+        begin = (work, dict(os.environ))
+        self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=begin)
         before = set(multiprocessing.active_children())
         with _interrupts_blocked():
             self._executor.submit(int)  # the executor starts its process with the first thing to do
         self._processes = set(multiprocessing.active_children()) - before
+        # Only the process itself holds the writing end: killed in the midst of a result it ends the pipe, and the
+        # executor's thread that reads there does not wait for the rest for ever.
+        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
 
     def submit(self, unit: Any) -> "Future[Outcome[Any]]":
         """Give it a unit."""
@@ -128,14 +150,16 @@ def _how(exit_code: int | None) -> str:
     return f"exit code {exit_code}"
 
 
-def _begin(work: bytes) -> None:
+def _begin(work: bytes, environment: dict[str, str]) -> None:
     """Begin a worker process."""
     global _bench
+    os.environ.clear()
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.path.append(str(Path.cwd()))  # for modules that the user names, at the end so that none is shadowed
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _bench = Bench(lambda: pickle.loads(work), lambda folder: folder)
-    atexit.register(_bench.close)
+    multiprocessing.util.Finalize(None, _bench.close, exitpriority=0)
 
 
 def _end_with_parent() -> None:

@@ -1,11 +1,11 @@
 """`run`: the one way to have units of work done."""
 
 import pickle
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import TypeVar
 
 from graspq.common.machine import available_cores
-from graspq.engine.local import LocalTeam
+from graspq.engine.local import LocalTeam, warm_up
 from graspq.engine.schedule import schedule
 from graspq.engine.settings import EngineSettings
 from graspq.engine.work import Work
@@ -22,6 +22,7 @@ def run(
     name: Callable[[U], str] = str,
     units_per_worker: int | None = None,
     cpus_per_worker: int = 1,
+    modules: Sequence[str] = (),
 ) -> Generator[tuple[U, R], None, None]:
     """Do units in workers and yield each with its result as it is finished, in any order.
 
@@ -37,6 +38,7 @@ def run(
         units_per_worker: a worker is renewed after so many; for native code that leaks.
         cpus_per_worker: cores that a worker takes of a Ray cluster, and by which the default number of workers is
             reckoned.
+        modules: what workers of this machine will import; see `warm_up`.
 
     Raises:
         UserError: a unit raised it; or units ended two workers each: these are named, after all others are done.
@@ -53,6 +55,7 @@ def run(
             team = RayTeam(work, cpus_per_worker)
             yield from schedule(team, units, workers, name, units_per_worker)
         return
+    warm_up(modules)
     count = settings.workers if settings.workers is not None else max(available_cores() // cpus_per_worker, 1)
     yield from schedule(LocalTeam(pickle.dumps(work)), units, count, name, units_per_worker)
 

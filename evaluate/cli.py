@@ -10,11 +10,15 @@ import click
 
 from graspq.common.errors import UserError
 from graspq.common.options import Command, options_from, with_version
+from graspq.engine import warm_up
 from graspq.evaluate.settings import EvalSettings
 
 if TYPE_CHECKING:
     from graspq.evaluate.evaluation import Prepared
 
+# What workers will import, while this process finds out what there is to do.
+MODULES = ("graspq.evaluate.rollout", "graspq.sim.episode")
+MODULES_OF_RUNS = ("graspq.policies.of_run", "graspq.train.networks.default")
 RESULTS = Path("runs/evaluations")
 
 
@@ -45,6 +49,8 @@ def evaluate(settings: EvalSettings) -> int:
     Raises:
         UserError: the settings describe no jobs, or the only job cannot be run.
     """
+    if settings.engine == "local" and settings.workers != 0 and not settings.plan:
+        warm_up((*MODULES, *(MODULES_OF_RUNS if settings.runs or settings.jobs is not None else ())))
     from graspq.evaluate.batch import make_plan, plan_table, run_plan
     from graspq.evaluate.jobs import jobs_from_settings
 

@@ -36,6 +36,14 @@ class Rollouts:
     scenes: Scenes
     policy: Policy
 
+    @property
+    def modules(self) -> list[str]:
+        """Names of the modules that a worker needs."""
+        acting = getattr(self.policy, "acting", None)
+        networks = acting.networks.values() if acting is not None else ()
+        own = [type(part).__module__ for part in (self.policy, *networks)]
+        return [__name__, "graspq.sim.episode", *own]
+
     def folders(self) -> Sequence[Path]:
         """Return the object set's folder."""
         return [self.scenes.objects]
@@ -94,7 +102,7 @@ def run_rollouts(
     rows: dict[int, EpisodeRow] = {}
     keeper = FilmKeeper(films)
     units = (range(first, min(first + EPISODES_PER_UNIT, episodes)) for first in range(0, episodes, EPISODES_PER_UNIT))
-    for _, played in run(work, units, settings, name=_name, units_per_worker=UNITS_PER_WORKER):
+    for _, played in run(work, units, settings, name=_name, units_per_worker=UNITS_PER_WORKER, modules=work.modules):
         for film in played:
             rows[film.row.episode] = film.row
             keeper.offer(film)

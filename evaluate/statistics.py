@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy  # its parts are imported when they are first used
 
 CONFIDENCE = 0.95
 
@@ -31,7 +31,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
 
     Source: Wilson 1927, as computed by `scipy.stats.binomtest`.
     """
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence_level=confidence, method="wilson")
+    interval = scipy.stats.binomtest(successes, trials).proportion_ci(confidence_level=confidence, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -83,7 +83,7 @@ def paired_difference(
     b, c = int(np.sum(one & ~two)), int(np.sum(~one & two))
     p1, p2 = (b + 1) / (count + 2), (c + 1) / (count + 2)
     half = _normal_quantile(confidence) * math.sqrt((p1 + p2 - (p1 - p2) ** 2) / (count + 2))
-    p_value = float(stats.binomtest(b, b + c, 0.5).pvalue) if b + c > 0 else 1.0
+    p_value = float(scipy.stats.binomtest(b, b + c, 0.5).pvalue) if b + c > 0 else 1.0
     low, high = max(-1.0, p1 - p2 - half), min(1.0, p1 - p2 + half)
     return PairedDifference((b - c) / count, low, high, b, c, count, p_value)
 
@@ -123,9 +123,9 @@ def mean_over_seeds(values: Sequence[float], confidence: float = CONFIDENCE) -> 
     if len(values) == 1:
         return MeanOverSeeds(mean, None, None, None, 1)
     deviation = float(np.std(values, ddof=1))
-    half = float(stats.t.ppf(0.5 + confidence / 2, len(values) - 1)) * deviation / math.sqrt(len(values))
+    half = float(scipy.stats.t.ppf(0.5 + confidence / 2, len(values) - 1)) * deviation / math.sqrt(len(values))
     return MeanOverSeeds(mean, mean - half, mean + half, deviation, len(values))
 
 
 def _normal_quantile(confidence: float) -> float:
-    return float(stats.norm.ppf(0.5 + confidence / 2))
+    return float(scipy.stats.norm.ppf(0.5 + confidence / 2))

@@ -26,7 +26,8 @@ class GoesForColour:
         action = way / LIMITS
         if np.abs(action).max() < 0.5:
             action[2] = -1  # over the goal: down
-        return np.clip(action, -1, 1)
+        clipped: np.ndarray = np.clip(action, -1, 1)
+        return clipped
 
     def plan(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Return where to go: x, y and phi of the blob that is narrowest across."""

@@ -76,6 +76,14 @@ def test_a_defect_carries_its_traceback():
         list(run(Squares(), [lambda: None], local(1), name=lambda unit: "a function"))
 
 
+def test_workers_that_are_ended_while_they_send_a_large_result_are_not_waited_for():
+    for _ in range(5):
+        results = run(Squares(), itertools.repeat(("large", 30_000_000)), local(2))
+        next(results)
+        results.close()
+    assert not children()
+
+
 def test_an_error_of_the_caller_leaves_no_process():
     def consume():
         for _ in run(Squares(), [1, ("sleep", 60)], local(2)):

@@ -51,6 +51,8 @@ class Squares:
                 raise UserError("--size: a mistake of the user's; choose another")
             case "defect":
                 raise ZeroDivisionError("deep in a worker")
+            case ("large", size):
+                return bytes(size)
             case ("sleep", seconds):
                 time.sleep(seconds)
                 return seconds
