@@ -215,7 +215,8 @@ def read_json(path: Path, what: str) -> Any:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path}: no {what} here") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    # Text that is no UTF-8 and numbers of thousands of digits are ValueErrors too.
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a readable {what} ({error})") from None
 
 

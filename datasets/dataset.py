@@ -187,22 +187,36 @@ def _refs(dataset: Dataset, entry: ShardEntry, footers: dict[Path, Any]) -> list
 def _check_agreement(datasets: list[Dataset]) -> None:
     first = datasets[0]
     for other in datasets[1:]:
-        for what, name in (
-            ("tasks", "task_name"),
-            ("image shapes", "image_shape"),
-            ("action limits", "action_limits"),
-            ("action spaces", "action"),
-            ("discounts", "discount"),
-        ):
-            ours, theirs = getattr(first.manifest, name), getattr(other.manifest, name)
-            if ours != theirs:
+        theirs = _agreed(other.manifest)
+        for what, ours in _agreed(first.manifest).items():
+            if ours != theirs[what]:
                 raise UserError(
-                    f"--shards: cannot mix {what}: {first.folder} has {_shown(ours)}, "
-                    f"{other.folder} has {_shown(theirs)}; train on one of them"
+                    f"--shards: cannot mix {what}: {first.folder} has {_shown(ours, theirs[what])}, "
+                    f"{other.folder} has {_shown(theirs[what], ours)}; train on one of them"
                 )
 
 
-def _shown(value: Any) -> str:
+def _agreed(manifest: Manifest) -> dict[str, Any]:
+    """Return what datasets must have in common to be trained on together."""
+    return {
+        "tasks": manifest.task_name,
+        "simulator versions": manifest.task.get("simulator_version"),
+        "task settings": manifest.task,
+        "image shapes": manifest.image_shape,
+        "action limits": manifest.action_limits,
+        "action spaces": manifest.action.to_json(),
+        "discounts": manifest.discount,
+        "object sets": f"{manifest.object_set.get('name')} ({str(manifest.object_set.get('sha256'))[:16]})",
+        "collection splits": manifest.settings.get("split"),
+    }
+
+
+def _shown(value: Any, other: Any) -> str:
+    """Say what a dataset has; of many settings only those that differ from the other dataset's."""
+    if isinstance(value, dict):
+        return ", ".join(
+            f"{name} = {value.get(name)}" for name in {**value, **other} if value.get(name) != other.get(name)
+        )
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 

@@ -47,7 +47,6 @@ class ImportSettings(Settings):
         None, help="Density in kg/m³, above 0; without it a URDF's mass counts, else 450 kg/m³."
     )
     name: str | None = setting(None, help="Name of the set; without it the name of SOURCE.")
-    skip_unusable: bool = setting(False, help="Leave out objects that cannot be used, with a line on each.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +88,8 @@ def targeted(settings: TargetedSettings) -> None:
 
 
 @make.command("import", help=(
-    f"Make a set of third-party meshes of {100 * SMALLEST:g} to {100 * LARGEST:g} cm; non-convex ones are decomposed."
+    f"Make a set of third-party meshes of {100 * SMALLEST:g} to {100 * LARGEST:g} cm; non-convex ones are decomposed, "
+    "unusable ones left out and named."
 ))  # fmt: skip
 @options_from(ImportSettings)
 def import_(settings: ImportSettings) -> None:
@@ -101,7 +101,7 @@ def import_(settings: ImportSettings) -> None:
         scale=settings.scale,
         density=settings.density,
         name=settings.name,
-        skip=(lambda line: tqdm.write(line, file=sys.stderr)) if settings.skip_unusable else None,
+        left_out=lambda line: tqdm.write(line, file=sys.stderr),
     )
     _report(made, there)
 

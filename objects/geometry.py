@@ -1,18 +1,15 @@
-"""Convex polytopes and the exact mass properties of their union.
+"""Convex parts: their hulls and face planes, the exact mass properties of their union, directions.
 
-A union of k convex parts is integrated by inclusion and exclusion over the intersections of its parts, which are convex
-polytopes themselves; so what overlaps counts once, without sampling.
-
-Dimension key: V vertices, F triangles, H half-spaces (one a face plane), P parts.
+Dimension key: V vertices, H half-spaces (one a face plane).
 """
 
 import dataclasses
 import math
 from collections.abc import Sequence
 
+import manifold3d
 import numpy as np
 import numpy.typing as npt
-import scipy.optimize
 import scipy.spatial
 import trimesh
 
@@ -81,7 +78,7 @@ def union_mass_properties(parts: Sequence[trimesh.Trimesh]) -> MassProperties:
     """Integrate over the union of convex parts, exactly.
 
     ∫_{∪ Pᵢ} f = Σ_{S ≠ ∅} (−1)^{|S|+1} ∫_{∩_{i∈S} Pᵢ} f; subsets S are grown one part at a time, and where an
-    intersection is empty so are those of its supersets.
+    intersection is empty or as thin as touching faces, so are those of its supersets.
 
     Args:
         parts: convex, watertight, faces outward; metres.
@@ -93,95 +90,48 @@ def union_mass_properties(parts: Sequence[trimesh.Trimesh]) -> MassProperties:
         UserError: so many parts lie inside each other that the sum would have more than 4,096 terms.
     """
     size = max(float(np.ptp(part.vertices, axis=0).max()) for part in parts)
-    planes = [half_spaces(part) for part in parts]
+    solids = [_solid(part) for part in parts]
     total = np.zeros(13)
-    level: list[tuple[tuple[int, ...], trimesh.Trimesh]] = [((index,), part) for index, part in enumerate(parts)]
+    level = list(enumerate(solids))
     terms, sign = 0, 1.0
     while level:
         terms += len(level)
         if terms > _MOST_INTERSECTIONS:
             raise UserError(f"{len(parts)} parts lie inside each other too often to integrate; merge some of them")
-        for _, polytope in level:
-            total += sign * _integrals(polytope)
+        total += sign * sum(_integrals(common) for _, common in level)
         level = [
-            ((*subset, index), common)
-            for subset, polytope in level
-            for index in range(subset[-1] + 1, len(parts))
-            if (common := _intersection(polytope, parts[index], [planes[i] for i in (*subset, index)], size))
-            is not None
+            (other, both)
+            for last, common in level
+            for other in range(last + 1, len(parts))
+            # A slab's volume over its surface is half its thickness.
+            if (both := common ^ solids[other]).volume() > _THIN * size * both.surface_area()
         ]
         sign = -sign
     return MassProperties(float(total[0]), total[1:4], total[4:].reshape(3, 3))
 
 
-def _integrals(mesh: trimesh.Trimesh) -> Array:
+def _solid(part: trimesh.Trimesh) -> manifold3d.Manifold:
+    return manifold3d.Manifold(manifold3d.Mesh64(np.asarray(part.vertices), np.asarray(part.faces, dtype=np.uint64)))
+
+
+def _integrals(solid: manifold3d.Manifold) -> Array:
     """Return volume, first moments and inertia about the origin of one solid as 13 numbers."""
+    mesh = solid.to_mesh64()
+    corners = mesh.vert_properties[:, :3][mesh.tri_verts]
     # Integrated near the origin and moved back (Steiner): far from it the differences of large numbers lose digits.
-    shift = mesh.vertices.mean(axis=0)
-    properties = trimesh.triangles.mass_properties((mesh.vertices - shift)[mesh.faces])
+    shift = corners.mean(axis=(0, 1))
+    properties = trimesh.triangles.mass_properties(corners - shift)
     volume, c = float(properties["volume"]), np.asarray(properties["center_mass"]) + shift
     inertia = np.asarray(properties["inertia"]) + volume * (c @ c * np.eye(3) - np.outer(c, c))
     return np.concatenate([[volume], volume * c, inertia.ravel()])
 
 
-def _intersection(
-    polytope: trimesh.Trimesh, part: trimesh.Trimesh, planes: Sequence[Array], size: float
-) -> trimesh.Trimesh | None:
-    """Return the intersection of `polytope` and `part`, or None where it is empty or thin.
-
-    `planes`: half-spaces [H, 4] of all parts that made `polytope`, and last those of `part`.
-    """
-    # Most pairs that do not meet are kept apart by a face of one of them (or by their boxes): no search is needed then.
-    low, high = (function(part.vertices, axis=0) for function in (np.min, np.max))
-    gap = np.minimum(high, polytope.vertices.max(axis=0)) - np.maximum(low, polytope.vertices.min(axis=0))
-    if gap.min() < _THIN * size:
-        return None
-    stacked = np.vstack(planes)
-    if _apart(planes[-1], polytope, size) or _apart(np.vstack(planes[:-1]), part, size):
-        return None
-    line = np.linspace(polytope.vertices.mean(axis=0), part.vertices.mean(axis=0), 9)
-    inside = _deepest(stacked, np.concatenate([line, polytope.vertices, part.vertices]), 1e-3 * size)
-    if inside is None:
-        inside = _largest_ball(stacked, _THIN * size)
-    if inside is None:
-        return None
-    corners = scipy.spatial.HalfspaceIntersection(stacked, inside).intersections
-    try:
-        return convex_hull(corners[np.isfinite(corners).all(axis=1)])
-    except ValueError:
-        return None
-
-
-def _apart(planes: Array, other: trimesh.Trimesh, size: float) -> bool:
-    """Return whether a face plane of one part has (all but a thin layer of) the other on its outer side."""
-    outside = planes[:, :3] @ other.vertices.T + planes[:, 3:]
-    return float(outside.min(axis=1).max()) > -_THIN * size
-
-
-def _deepest(planes: Array, candidates: Array, least: float) -> Array | None:
-    """Return the candidate [3] that lies deepest inside half-spaces [H, 4], None when that is less than `least`."""
-    depths = -(candidates @ planes[:, :3].T + planes[:, 3]).max(axis=1)
-    best = int(depths.argmax())
-    point: Array = candidates[best]
-    return point if depths[best] > least else None
-
-
-def _largest_ball(planes: Array, least: float) -> Array | None:
-    """Return the centre of the largest ball inside half-spaces [H, 4], None when its radius is less than `least`.
-
-    The Chebyshev centre: maximise r subject to n·x + r ≤ −d for each plane.
-    """
-    result = scipy.optimize.linprog(
-        [0.0, 0.0, 0.0, -1.0],
-        A_ub=np.c_[planes[:, :3], np.ones(len(planes))],
-        b_ub=-planes[:, 3],
-        bounds=[(None, None)] * 4,
-        method="highs-ds",
-    )
-    if not result.success or result.x[3] < least:
-        return None
-    point: Array = result.x[:3]
-    return point
+def horizontal_axes(up: Array) -> Array:
+    """Return two unit vectors, the columns of [3, 2], that make a right-handed frame with `up` [3] as its third."""
+    helper = np.eye(3)[int(np.abs(up).argmin())]
+    first = np.cross(up, helper)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first)], axis=1)
 
 
 def principal_axes(inertia: Array) -> tuple[Array, Array]:

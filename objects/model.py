@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from graspq.objects.geometry import Array, MassProperties, principal_axes, union_mass_properties
+from graspq.objects.geometry import Array, principal_axes, union_mass_properties
 
 # 0.1 micrometre: what an OBJ file keeps of a coordinate.
 COORDINATE_DECIMALS = 7
@@ -39,29 +39,37 @@ class ObjectModel:
     volume: float
 
     @property
-    def points(self) -> Array:
-        """All vertices of all parts [V, 3]."""
-        return np.concatenate([part.vertices for part in self.parts])
-
-    @property
     def extents(self) -> tuple[float, float, float]:
         """Side lengths of the axis-parallel bounding box in the body frame, metres."""
-        x, y, z = (float(length) for length in np.ptp(self.points, axis=0))
+        points = np.concatenate([part.vertices for part in self.parts])
+        x, y, z = (round(float(length), COORDINATE_DECIMALS) for length in np.ptp(points, axis=0))
         return x, y, z
-
-    @property
-    def triangles(self) -> int:
-        """Number of triangles of all parts."""
-        return sum(len(part.faces) for part in self.parts)
 
 
 @dataclasses.dataclass(frozen=True)
-class Body:
-    """Convex parts in the body frame, not scaled yet, with their principal moments for density 1."""
+class Solid:
+    """Convex parts in the body frame, of no size or density yet: their union's volume and principal moments [3]."""
 
     parts: tuple[trimesh.Trimesh, ...]
     volume: float
     moments: Array
+
+    @classmethod
+    def of(cls, parts: Sequence[trimesh.Trimesh]) -> "Solid":
+        """Move convex parts into the body frame of their union.
+
+        Raises:
+            UserError: too many parts lie inside each other; see `union_mass_properties`.
+        """
+        properties = union_mass_properties(parts)
+        moments, axes = principal_axes(properties.inertia_about_centre())
+        # On a grid, so that a last-bit difference between machines cannot reach the vertices.
+        centre = np.round(properties.centre, COORDINATE_DECIMALS)
+        moved = tuple(
+            trimesh.Trimesh((part.vertices - centre) @ axes, part.faces, process=False, validate=False)
+            for part in parts
+        )
+        return cls(moved, properties.volume, moments)
 
     @property
     def points(self) -> Array:
@@ -69,22 +77,11 @@ class Body:
         return np.concatenate([part.vertices for part in self.parts])
 
     def model(
-        self,
-        *,
-        object_id: str,
-        split: str,
-        families: Sequence[str],
-        color: Color,
-        scale: float = 1.0,
-        density: float | None = None,
-        mass: float | None = None,
+        self, *, object_id: str, split: str, families: Sequence[str], color: Color, mass: float, scale: float = 1.0
     ) -> ObjectModel:
-        """Return the body at `scale` with either a density (kg/m³) or a mass (kg)."""
+        """Return the object of this shape, `scale` times as large and of `mass` kg."""
         volume = self.volume * scale**3
-        if mass is None:
-            assert density is not None, "give a density or a mass"
-            mass = density * volume
-        moments = [significant(value * scale**5 * mass / volume) for value in self.moments]
+        x, y, z = (_significant(moment * scale**5 * mass / volume) for moment in self.moments)
         parts = tuple(
             trimesh.Trimesh(_on_grid(part.vertices * scale), part.faces, process=False, validate=False)
             for part in self.parts
@@ -95,26 +92,10 @@ class Body:
             families=tuple(families),
             color=color,
             parts=parts,
-            mass=significant(mass),
-            inertia=(moments[0], moments[1], moments[2]),
-            volume=significant(volume),
+            mass=_significant(mass),
+            inertia=(x, y, z),
+            volume=_significant(volume),
         )
-
-
-def body_from_parts(parts: Sequence[trimesh.Trimesh]) -> Body:
-    """Move convex parts into the body frame of their union.
-
-    Raises:
-        UserError: too many parts lie inside each other; see `union_mass_properties`.
-    """
-    properties: MassProperties = union_mass_properties(parts)
-    moments, axes = principal_axes(properties.inertia_about_centre())
-    # On a grid, so that a last-bit difference between machines cannot reach the vertices.
-    centre = np.round(properties.centre, COORDINATE_DECIMALS)
-    moved = tuple(
-        trimesh.Trimesh((part.vertices - centre) @ axes, part.faces, process=False, validate=False) for part in parts
-    )
-    return Body(moved, properties.volume, moments)
 
 
 def _on_grid(vertices: Array) -> Array:
@@ -123,9 +104,9 @@ def _on_grid(vertices: Array) -> Array:
     return rounded
 
 
-def significant(value: float, digits: int = 7) -> float:
-    """Return `value` rounded to so many significant digits."""
-    return float(f"{value:.{digits - 1}e}")
+def _significant(value: float) -> float:
+    """Return `value` rounded to seven significant digits."""
+    return float(f"{value:.6e}")
 
 
 def draw_color(rng: np.random.Generator) -> Color:

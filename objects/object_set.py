@@ -5,8 +5,9 @@ Procedural, targeted and third-party sets are all held by this one interface.
 
 import dataclasses
 import functools
-import hashlib
 import json
+import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,22 @@ import trimesh
 
 from graspq.common.errors import UserError
 from graspq.common.files import read_json, sha256_of
-from graspq.objects.export import read_obj_parts
+from graspq.objects.mesh_files import read_obj_parts, urdf_text
 from graspq.objects.model import Color
 from graspq.objects.publishing import MANIFEST, published
 
 FORMAT_VERSION = 1
+_PLAIN_NAME = re.compile(r"\w[\w.-]*", re.ASCII)
+
+
+def mesh_file(object_id: str) -> str:
+    """Return the path of an object's OBJ, relative to its set's folder."""
+    return f"meshes/{object_id}.obj"
+
+
+def urdf_file(object_id: str) -> str:
+    """Return the path of an object's URDF, relative to its set's folder."""
+    return f"meshes/{object_id}.urdf"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,36 +65,37 @@ class ObjectRecord:
         """Return the record that `to_json` wrote.
 
         Raises:
-            KeyError, TypeError, ValueError: a field is missing, unknown or of the wrong kind.
+            KeyError, TypeError, ValueError, AttributeError: a field is missing, unknown, or not as expected.
         """
-        known = {field.name for field in dataclasses.fields(cls)}
-        if set(values) != known:
-            raise ValueError(f"expected the fields {', '.join(sorted(known))}")
-        red, green, blue, alpha = (float(value) for value in values["color"])
-        inertia, extents = ([float(value) for value in values[name]] for name in ("inertia", "extents"))
-        if len(inertia) != 3 or len(extents) != 3 or not values["mass"] > 0:
-            raise ValueError("inertia and extents are three numbers each, and a mass is above 0")
-        return cls(
-            object_id=str(values["object_id"]),
-            split=str(values["split"]),
-            families=tuple(str(family) for family in values["families"]),
-            color=(red, green, blue, alpha),
-            mass=float(values["mass"]),
-            inertia=(inertia[0], inertia[1], inertia[2]),
-            volume=float(values["volume"]),
-            extents=(extents[0], extents[1], extents[2]),
-            parts=int(values["parts"]),
-            mesh=str(values["mesh"]),
-            urdf=str(values["urdf"]),
-            sha256={str(path): str(digest) for path, digest in values["sha256"].items()},
-        )
+        fields: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+        }
+        record = cls(**fields)
+        if not all(isinstance(word, str) for word in (record.object_id, record.split, *record.families)):
+            raise ValueError("expected words for object_id, split and families")
+        if not _PLAIN_NAME.fullmatch(record.object_id):
+            raise ValueError(f"object_id {record.object_id!r}: expected letters, digits, '_', '.' and '-'")
+        # A set names no files but its own.
+        files = mesh_file(record.object_id), urdf_file(record.object_id)
+        if (record.mesh, record.urdf) != files or set(record.sha256) != set(files):
+            raise ValueError(f"{record.object_id}: expected the files {files[0]} and {files[1]}")
+        positive = (record.mass, record.volume, *record.inertia, *record.extents)
+        numbers = (*positive, *record.color)
+        if [len(record.inertia), len(record.extents), len(record.color)] != [3, 3, 4] or not all(
+            isinstance(number, int | float) and math.isfinite(number) for number in numbers
+        ):
+            raise ValueError(f"{record.object_id}: expected finite numbers, three or four where there are several")
+        if min(positive) <= 0 or not all(0 <= share <= 1 for share in record.color):
+            raise ValueError(f"{record.object_id}: expected sizes above 0 and colours of 0 to 1")
+        return record
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectSet:
     """A set of objects; `objects` keeps the order of `object_set.json`.
 
-    `name`: what it is, such as "procedural"; `generator_version` and `seed`: what made it, None for third-party meshes.
+    `name`: what it is, such as "procedural"; `generator_version` and `seed`: what made it, None for third-party meshes;
+    `sha256`: digest of `object_set.json`, which holds those of all other files.
     """
 
     folder: Path
@@ -103,27 +116,30 @@ class ObjectSet:
         path = folder / MANIFEST
         values = read_json(path, "object set (make one with grasp-objects make)")
         try:
-            if values["format_version"] != FORMAT_VERSION:
-                raise UserError(
-                    f"{path}: format_version {values['format_version']!r}, expected {FORMAT_VERSION}; make it again"
-                )
-            objects = tuple(ObjectRecord.from_json(record) for record in values["objects"])
-            version, seed = values["generator_version"], values["seed"]
-            loaded = cls(folder, str(values["name"]), version, seed, objects, sha256_of(path))
-        except UserError:
-            raise
+            version = values["format_version"]
+            if version == FORMAT_VERSION:
+                objects = tuple(ObjectRecord.from_json(record) for record in values["objects"])
+                origin = str(values["name"]), values["generator_version"], values["seed"]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UserError(f"{path}: not a readable object set ({error!r}); make the set again") from None
+        if version != FORMAT_VERSION:
+            raise UserError(f"{path}: format_version {version!r}, expected {FORMAT_VERSION}; make it again")
+        loaded = cls(folder, *origin, objects, sha256_of(path))
         if not objects or len(loaded._by_id) != len(objects):
             raise UserError(f"{path}: expected one or more objects with ids of their own; make the set again")
-        for record in objects:
-            if any((folder / file).is_symlink() or not _inside(file) for file in record.sha256):
-                raise UserError(f"{path}: the files of {record.object_id} must lie inside the set's folder")
+        files = (file for record in objects for file in record.sha256)
+        if any((folder / file).is_symlink() for file in ("meshes", *files)):
+            raise UserError(f"{path}: the files of a set lie in its folder, but a link is among them; copy them there")
         return loaded
 
     @functools.cached_property
     def _by_id(self) -> dict[str, ObjectRecord]:
         return {record.object_id: record for record in self.objects}
+
+    @functools.cached_property
+    def _checked(self) -> set[str]:
+        """Ids of the objects whose files `urdf_of` has checked."""
+        return set()
 
     def __len__(self) -> int:
         """Return the number of objects."""
@@ -162,6 +178,27 @@ class ObjectSet:
         """
         return read_obj_parts(self.folder / self[object_id].mesh)
 
+    def urdf_of(self, object_id: str) -> Path:
+        """Return the path of one object's URDF, after checking that a simulator can be given it and its mesh.
+
+        Raises:
+            UserError: no such object, its mesh is unreadable, or its URDF says anything but what the record says.
+        """
+        record = self[object_id]
+        path = self.folder / record.urdf
+        if object_id in self._checked:
+            return path
+        self.parts_of(object_id)
+        expected = urdf_text(object_id, mass=record.mass, inertia=record.inertia, color=record.color)
+        try:
+            same = path.read_bytes() == expected.encode()
+        except OSError as error:
+            raise _unreadable(path, error) from None
+        if not same:
+            raise UserError(f"{path}: says something else than {MANIFEST}; make the object set again")
+        self._checked.add(object_id)
+        return path
+
     def digest(self) -> str:
         """Return the SHA-256 of `object_set.json`, which holds those of all other files."""
         return self.sha256
@@ -172,10 +209,15 @@ class ObjectSet:
         Raises:
             UserError: naming the first file that is missing or differs.
         """
-        for record in self.objects:
-            for file, expected in record.sha256.items():
-                _check(self.folder / file, expected)
-        _check(self.folder / MANIFEST, self.sha256)
+        digests = {file: digest for record in self.objects for file, digest in record.sha256.items()}
+        for file, expected in {**digests, MANIFEST: self.sha256}.items():
+            path = self.folder / file
+            try:
+                actual = sha256_of(path)
+            except OSError as error:
+                raise _unreadable(path, error) from None
+            if actual != expected:
+                raise UserError(f"{path}: damaged, its SHA-256 is not the one in {MANIFEST}; make the object set again")
 
     def copy_to(self, folder: Path | str) -> "ObjectSet":
         """Copy the set byte for byte and return the copy; an identical copy that is there already is kept.
@@ -185,27 +227,17 @@ class ObjectSet:
         """
         folder = Path(folder)
         self.verify()
-        with published(folder, what="object set") as temporary:
+        with published(folder) as temporary:
+            (temporary / "meshes").mkdir()
             for file in (MANIFEST, *(file for record in self.objects for file in record.sha256)):
-                (temporary / file).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(self.folder / file, temporary / file)
         copy = ObjectSet.load(folder)
         copy.verify()
         return copy
 
 
-def _inside(file: str) -> bool:
-    path = Path(file)
-    return not path.is_absolute() and ".." not in path.parts
-
-
-def _check(path: Path, expected: str) -> None:
-    try:
-        actual = sha256_of(path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); make the object set again") from None
-    if actual != expected:
-        raise UserError(f"{path}: damaged, its SHA-256 is not the one in {MANIFEST}; make the object set again")
+def _unreadable(path: Path, error: OSError) -> UserError:
+    return UserError(f"{path}: cannot be read ({error.strerror}); make the object set again")
 
 
 def manifest_text(*, name: str, generator_version: str | None, seed: int | None, records: list[ObjectRecord]) -> str:
@@ -219,8 +251,3 @@ def manifest_text(*, name: str, generator_version: str | None, seed: int | None,
     lines = [f"  {json.dumps(key)}: {json.dumps(value)}," for key, value in header.items()]
     objects = ",\n".join("    " + json.dumps(record.to_json(), ensure_ascii=False) for record in records)
     return "{\n" + "\n".join(lines) + '\n  "objects": [\n' + objects + "\n  ]\n}\n"
-
-
-def sha256_of_text(text: str) -> str:
-    """Return the SHA-256 of a text's UTF-8 bytes."""
-    return hashlib.sha256(text.encode()).hexdigest()

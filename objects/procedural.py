@@ -14,7 +14,7 @@ import numpy as np
 from graspq.common.errors import UserError
 from graspq.common.seeding import generator
 from graspq.objects.geometry import Array
-from graspq.objects.model import Body, Color, ObjectModel, body_from_parts, draw_color
+from graspq.objects.model import Color, ObjectModel, Solid, draw_color
 from graspq.objects.object_set import ObjectSet
 from graspq.objects.resting import resting_poses
 from graspq.objects.shapes import COMPOSITE, FAMILIES, draw_shape
@@ -24,8 +24,6 @@ from graspq.objects.writing import write_object_set
 GENERATOR_VERSION = "1"
 SPLITS = ("train", "test")
 _MOST_DRAWS = 1000
-
-
 Bounds: TypeAlias = tuple[float, float]
 
 
@@ -105,20 +103,21 @@ def draw_object(rng: np.random.Generator, family: str, *, object_id: str, split:
         shape = draw_shape(rng, family)
         if sum(len(part.faces) for part in shape.parts) > LIMITS.triangles:
             continue
-        body = body_from_parts(shape.parts)
+        solid = Solid.of(shape.parts)
         density = rng.uniform(*LIMITS.density)
-        least, most = scale_bounds(body, density, LIMITS.typical_width[family in COMPOSITE])
+        least, most = scale_bounds(solid, density, LIMITS.typical_width[family in COMPOSITE])
         if least < most:
             scale = rng.uniform(least, most)
-            return body.model(
-                object_id=object_id, split=split, families=shape.families, color=color, scale=scale, density=density
+            mass = density * (solid.volume * scale**3)
+            return solid.model(
+                object_id=object_id, split=split, families=shape.families, color=color, mass=mass, scale=scale
             )
     raise RuntimeError(f"no {family} within the limits in {_MOST_DRAWS} draws")
 
 
-def scale_bounds(body: Body, density: float, typical_width: Bounds) -> Bounds:
+def scale_bounds(solid: Solid, density: float, typical_width: Bounds) -> Bounds:
     """Return the least and greatest scale that keep all limits, metres per unit; none does when least > greatest."""
-    points = body.points
+    points = solid.points
     poses = resting_poses(points, np.zeros(3), least=0.02)
     probability = np.array([pose.probability for pose in poses])
     probability /= probability.sum()
@@ -134,7 +133,7 @@ def scale_bounds(body: Body, density: float, typical_width: Bounds) -> Bounds:
             (typical_width, float(probability @ widths)),
         )
     ]
-    lightest, heaviest = (math.cbrt(mass / (density * body.volume)) for mass in LIMITS.mass)
+    lightest, heaviest = (math.cbrt(mass / (density * solid.volume)) for mass in LIMITS.mass)
     bounds.append((lightest, heaviest))
     return max(least for least, _ in bounds), min(most for _, most in bounds)
 

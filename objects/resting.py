@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.spatial
 
-from graspq.objects.geometry import Array
+from graspq.objects.geometry import Array, horizontal_axes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +98,6 @@ def narrowest_width(points: Array, up: Array) -> float:
 
     The least width of a convex polygon is attained perpendicular to one of its edges (rotating calipers).
     """
-    helper = np.eye(3)[int(np.abs(up).argmin())]
-    first = np.cross(up, helper)
-    first /= np.linalg.norm(first)
-    flat = points @ np.stack([first, np.cross(up, first)], axis=1)
+    flat = points @ horizontal_axes(up)
     outline = scipy.spatial.ConvexHull(flat)
     return float(np.ptp(flat[outline.vertices] @ outline.equations[:, :2].T, axis=0).min())

@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from graspq.objects.geometry import Array, convex_hull
 
@@ -169,14 +170,8 @@ SIMPLE = tuple(name for name in FAMILIES if name not in COMPOSITE)
 
 def rotation(rng: Generator) -> Array:
     """Draw a rotation matrix [3, 3], uniform over all rotations (a normalised Gaussian quaternion)."""
-    w, x, y, z = (value := rng.normal(size=4)) / math.sqrt(float(value @ value))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn: Array = Rotation.from_quat(rng.normal(size=4), scalar_first=True).as_matrix()
+    return turn
 
 
 def draw_shape(rng: Generator, family: str) -> Shape:

@@ -7,13 +7,13 @@ import math
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from graspq.common.errors import UserError
 from graspq.common.files import committed
 from graspq.objects.drawing import BACKGROUND, draw, standing
-from graspq.objects.geometry import Array
 from graspq.objects.object_set import ObjectRecord, ObjectSet
 from graspq.objects.resting import resting_poses
 
@@ -55,7 +55,7 @@ def _figure(object_set: ObjectSet, ids: tuple[str, ...], which: str, split: str 
     wide, high = max(columns, 3) * _CELL_INCHES, _HEAD_INCHES + rows * row_inches + 0.1
     figure = Figure(figsize=(wide, high))
     scenes = {name: _scene(object_set, name) for name in ids}
-    cover = 1.22 * max(_span(triangles) for triangles in scenes.values())
+    cover = 1.22 * max(_span(parts) for parts in scenes.values())
     left = (wide - columns * _CELL_INCHES) / 2
     for place, name in enumerate(ids):
         row, column = divmod(place, columns)
@@ -76,14 +76,14 @@ def _columns(count: int) -> int:
     return min(range(ideal, ideal + 3), key=lambda columns: (-count % columns, columns))
 
 
-def _scene(object_set: ObjectSet, object_id: str) -> Array:
+def _scene(object_set: ObjectSet, object_id: str) -> list[trimesh.Trimesh]:
     parts = object_set.parts_of(object_id)
     pose = resting_poses(np.concatenate([part.vertices for part in parts]), np.zeros(3))[0]
     return standing(parts, pose.up)
 
 
-def _span(triangles: Array) -> float:
-    points = triangles.reshape(-1, 3)
+def _span(parts: list[trimesh.Trimesh]) -> float:
+    points = np.concatenate([part.vertices for part in parts])
     return float(max(2 * np.linalg.norm(points[:, :2], axis=1).max(), np.ptp(points[:, 2])))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from graspq.common.errors import UserError
 from graspq.common.seeding import generator
-from graspq.objects.model import Color, ObjectModel, body_from_parts
+from graspq.objects.model import Color, ObjectModel, Solid
 from graspq.objects.object_set import ObjectSet
 from graspq.objects.procedural import GENERATOR_VERSION, draw_object
 from graspq.objects.shapes import cuboid
@@ -16,8 +16,7 @@ from graspq.objects.writing import write_object_set
 
 TARGET = "cross"
 PURPLE: Color = (0.56, 0.12, 0.86, 1.0)
-_CROSS_LENGTH, _CROSS_WIDTH, _CROSS_HEIGHT = 0.085, 0.026, 0.026
-_CROSS_DENSITY = 500.0
+_CROSS_LENGTH, _CROSS_WIDTH, _CROSS_DENSITY = 0.085, 0.026, 500.0
 
 # Main family and colour of each distractor; its proportions come from the seed. No hue is near the target's.
 _DISTRACTORS: dict[str, tuple[tuple[str, Color], ...]] = {
@@ -57,12 +56,10 @@ def make_targeted(folder: Path | str, *, seed: int) -> ObjectSet:
 
 def cross() -> ObjectModel:
     """Return the target: two bars of 8.5 × 2.6 × 2.6 cm that cross at right angles, purple."""
-    bars = [
-        cuboid((_CROSS_LENGTH, _CROSS_WIDTH, _CROSS_HEIGHT)),
-        cuboid((_CROSS_WIDTH, _CROSS_LENGTH, _CROSS_HEIGHT)),
-    ]
-    return body_from_parts(bars).model(
-        object_id=TARGET, split="target", families=("cross",), color=PURPLE, density=_CROSS_DENSITY
+    length, width = _CROSS_LENGTH, _CROSS_WIDTH
+    solid = Solid.of([cuboid((length, width, width)), cuboid((width, length, width))])
+    return solid.model(
+        object_id=TARGET, split="target", families=("cross",), color=PURPLE, mass=_CROSS_DENSITY * solid.volume
     )
 
 

@@ -7,9 +7,9 @@ mass and inertia are those of the union of the pieces.
 import hashlib
 import math
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -17,9 +17,9 @@ import trimesh
 from graspq.common.errors import UserError
 from graspq.common.seeding import generator
 from graspq.objects.geometry import Array, convex_hull
-from graspq.objects.model import ObjectModel, body_from_parts, draw_color
+from graspq.objects.model import ObjectModel, Solid, draw_color
 from graspq.objects.object_set import ObjectSet
-from graspq.objects.urdf import Source, read_urdf
+from graspq.objects.urdf import Description, read_urdf
 from graspq.objects.writing import write_object_set
 
 SMALLEST, LARGEST = 0.01, 0.30
@@ -28,7 +28,6 @@ MOST_PARTS = 16
 _MESH_SUFFIXES = (".obj", ".stl")
 # Bullet advises against hulls of more than about 100 points; beyond this a hull is taken of its extreme points.
 _MOST_VERTICES = 64
-_TEST_EVERY = 10
 _CONVEX = 0.99
 _FLAT = 1e-6
 
@@ -40,13 +39,13 @@ def import_meshes(
     scale: float = 1.0,
     density: float | None = None,
     name: str | None = None,
-    skip: Callable[[str], None] | None = None,
+    left_out: Callable[[str], None] = warnings.warn,
 ) -> ObjectSet:
-    """Make an object set of all meshes under `source` and return it.
+    """Make an object set of all usable meshes under `source` and return it.
 
     Where there are URDFs, they are the objects (one rigid body each) and name their meshes; else every OBJ and STL is
-    one. Ids are the files' names. Split: where all ids are numbers, those that end in 0 are "test", as in the paper;
-    else every tenth of the sorted ids, from the first; the others are "train". A single object is "train".
+    one. Ids are the files' names. A mesh is unusable where it is unreadable, empty or flat, or its longest side is
+    outside 1 cm to 30 cm.
 
     Args:
         source: folder to search, subfolders included.
@@ -54,11 +53,11 @@ def import_meshes(
         scale: metres per unit of the files (a URDF's own mesh scale comes first), > 0.
         density: kg/m³; None takes the mass a URDF states, and 450 kg/m³ where none does.
         name: of the set; None takes the name of `source`.
-        skip: called with a line on each object that cannot be used, which is then left out; None refuses the folder.
+        left_out: called with a line on each object that cannot be used; the others make the set.
 
     Raises:
-        UserError: no such folder or no meshes in it; a mesh is unreadable, empty, flat, or its longest side is outside
-            1 cm to 30 cm; or the set cannot be written. Nothing is then left.
+        UserError: no such folder, no meshes in it or none that can be used, or the set cannot be written. Nothing is
+            then left.
     """
     source = Path(source)
     if not (scale > 0 and math.isfinite(scale)):
@@ -66,17 +65,24 @@ def import_meshes(
     if density is not None and not (density > 0 and math.isfinite(density)):
         raise UserError(f"--density: expected a number of kg/m³ above 0, got {density}")
     files = _object_files(source)
-    ids = list(files)
-    models = (
-        model
-        for one in ids
-        if (model := _usable(skip, source, one, files[one], split_of(one, ids), scale, density)) is not None
-    )
+
+    def models() -> Iterator[ObjectModel]:
+        splits, unusable = splits_of(list(files)), list[str]()
+        for object_id, path in files.items():
+            try:
+                model = _model(source, object_id, path, splits[object_id], scale, density)
+            except UserError as error:
+                unusable.append(error.message)
+            else:
+                yield model
+        if len(unusable) == len(files):
+            others = f" (and {len(files) - 1} others cannot be used either)" if len(files) > 1 else ""
+            raise UserError(f"{unusable[0]}{others}")
+        for line in unusable:
+            left_out(f"left out {line}")
+
     return write_object_set(
-        Path(folder),
-        models,
-        name=name if name is not None else _clean(source.resolve().name),
-        total=len(files),
+        Path(folder), models(), name=name if name is not None else _clean(source.resolve().name), total=len(files)
     )
 
 
@@ -103,47 +109,43 @@ def _clean(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._") or "object"
 
 
-def split_of(object_id: str, ids: list[str]) -> str:
-    """Return "test" or "train" for one of the sorted `ids`; the rule is `import_meshes`'s."""
-    if len(ids) == 1:
-        return "train"
-    if all(name.isdigit() for name in ids) and any(name.endswith("0") for name in ids):
-        return "test" if object_id.endswith("0") else "train"
-    return "test" if ids.index(object_id) % _TEST_EVERY == 0 else "train"
+def splits_of(ids: Sequence[str]) -> dict[str, str]:
+    """Return the split of each object, "train" or "test".
 
-
-def _usable(skip: Callable[[str], None] | None, *described: Any) -> ObjectModel | None:
-    """Return the model, or None where it cannot be used and `skip` takes the reason."""
-    try:
-        return _model(*described)
-    except UserError as error:
-        if skip is None:
-            raise UserError(f"{error.message}; or leave such objects out with --skip-unusable") from None
-        skip(f"left out {error.message}")
-        return None
+    Where all ids are numbers, those that end in 0 are "test", as in the paper. Else a tenth is, chosen by the SHA-256
+    of each id, but at least one and never all: adding objects to two or more moves none from "train" to "test".
+    """
+    if all(name.isdigit() for name in ids) and any(name.endswith("0") for name in ids) and len(ids) > 1:
+        return {name: "test" if name.endswith("0") else "train" for name in ids}
+    places = {name: int.from_bytes(hashlib.sha256(name.encode()).digest()[-6:]) / 2**48 for name in ids}
+    first, last = min(ids, key=places.__getitem__), max(ids, key=places.__getitem__)
+    return {name: "test" if (places[name] < 0.1 or name == first) and name != last else "train" for name in ids}
 
 
 def _model(source: Path, object_id: str, path: Path, split: str, scale: float, density: float | None) -> ObjectModel:
-    described = read_urdf(path, source) if path.suffix.lower() == ".urdf" else Source(((path, np.eye(4)),), None, None)
+    described = Description(((path, np.eye(4)),), mass=None, color=None)
+    if path.suffix.lower() == ".urdf":
+        described = read_urdf(path, source)
     pieces = [
         mesh.apply_transform(transform).apply_scale(scale)
         for file, transform in described.meshes
         for mesh in _read_meshes(file)
     ]
-    _check_scale(path, np.concatenate([piece.vertices for piece in pieces]), scale)
+    _check_size(path, np.concatenate([piece.vertices for piece in pieces]), scale)
     parts, families = convex_parts(pieces, path)
     color = described.color
     if color is None:
         # A function of the id alone, so that an object keeps its colour when others are added.
         key = int.from_bytes(hashlib.sha256(object_id.encode()).digest()[:6], "little")
         color = draw_color(generator("objects/import", key))
-    mass = described.mass if density is None else None
-    chosen = density if density is not None else DENSITY
     try:
-        body = body_from_parts(parts)
+        solid = Solid.of(parts)
     except UserError as error:
         raise UserError(f"{path}: {error.message}") from None
-    return body.model(object_id=object_id, split=split, families=families, color=color, density=chosen, mass=mass)
+    mass = described.mass if density is None else None
+    if mass is None:
+        mass = (density if density is not None else DENSITY) * solid.volume
+    return solid.model(object_id=object_id, split=split, families=families, color=color, mass=mass)
 
 
 def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
@@ -167,7 +169,7 @@ def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
     return meshes
 
 
-def _check_scale(path: Path, points: Array, scale: float) -> None:
+def _check_size(path: Path, points: Array, scale: float) -> None:
     longest = float(np.ptp(points, axis=0).max())
     if SMALLEST <= longest <= LARGEST:
         return

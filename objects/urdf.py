@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from graspq.common.errors import UserError
 from graspq.objects.geometry import Array
@@ -16,7 +17,7 @@ from graspq.objects.model import Color
 
 
 @dataclasses.dataclass(frozen=True)
-class Source:
+class Description:
     """Meshes with their transforms [4, 4] (scale included) to the body, mass in kg or None, colour or None."""
 
     meshes: tuple[tuple[Path, Array], ...]
@@ -24,84 +25,62 @@ class Source:
     color: Color | None
 
 
-def read_urdf(path: Path, root: Path) -> Source:
+def read_urdf(path: Path, root: Path) -> Description:
     """Return the one rigid body that a URDF describes; its collision meshes, or the visual ones where there are none.
 
     Args:
         path: the URDF.
-        root: where `package://` paths are searched, besides the URDF's own folder.
+        root: the folder that holds all meshes; `package://` paths are searched there.
 
     Raises:
-        UserError: not a URDF, not one body, no mesh in it, or a mesh that does not exist.
+        UserError: not a URDF, not one body, no mesh in it, or a mesh that does not exist inside `root`.
     """
     try:
         robot = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError, ValueError) as error:
-        raise UserError(f"{path}: not a readable URDF ({error}); repair or remove it") from None
-    links = [
-        link for link in robot.iter("link") if link.find("collision") is not None or link.find("visual") is not None
-    ]
-    if len(links) != 1:
-        raise UserError(f"{path}: expected one rigid body, found {len(links)} links with a shape; remove it")
-    shapes = links[0].findall("collision") or links[0].findall("visual")
-    try:
+        links = [
+            link for link in robot.iter("link") if link.find("collision") is not None or link.find("visual") is not None
+        ]
+        if len(links) != 1:
+            raise UserError(f"{path}: expected one rigid body, found {len(links)} links with a shape; remove it")
+        shapes = links[0].findall("collision") or links[0].findall("visual")
         meshes = tuple(_mesh(shape, path, root) for shape in shapes)
-        mass = _number(links[0].find("inertial/mass"))
-        return Source(meshes, mass if mass is not None and mass > 0 else None, _color(links[0], robot))
+        stated = links[0].find("inertial/mass")
+        mass = float(stated.get("value", "nan")) if stated is not None else math.nan
+        return Description(meshes, mass if 0 < mass < math.inf else None, _color(links[0], robot))
     except UserError:
         raise
-    except ValueError as error:
+    except (ElementTree.ParseError, OSError, ValueError) as error:
         raise UserError(f"{path}: not a readable URDF ({error}); repair or remove it") from None
 
 
 def _mesh(shape: ElementTree.Element, path: Path, root: Path) -> tuple[Path, Array]:
+    """Return the mesh of a collision or visual shape and its transform."""
     mesh = shape.find("geometry/mesh")
     if mesh is None or not mesh.get("filename"):
         raise UserError(f"{path}: has a shape that is no mesh; only meshes are read, so replace it by one")
     name = str(mesh.get("filename"))
-    relative = name.removeprefix("package://").removeprefix("file://")
-    places = [path.parent / relative, root / relative, root.parent / relative]
-    # Of a package:// path the first part is the package, which may be `root` itself.
-    places += [root / Path(relative).relative_to(Path(relative).parts[0])] if name.startswith("package://") else []
-    found = next((place for place in places if place.is_file()), None)
+    relative = Path(name.removeprefix("package://").removeprefix("file://"))
+    # Of a package:// path the first part is the package, which may be `root` itself or a folder in it.
+    places = [path.parent / relative, root / relative, root / Path(*relative.parts[1:])]
+    inside = (place for place in places if place.is_file() and place.resolve().is_relative_to(root.resolve()))
+    found = next(inside, None)
     if found is None:
-        raise UserError(f"{path}: names the mesh {name!r}, which is not there; add it or remove the URDF")
-    scale = _numbers(mesh.get("scale"), (1.0, 1.0, 1.0))
+        raise UserError(f"{path}: names the mesh {name!r}, which is not in {root}; add it or remove the URDF")
+    scale = _numbers(mesh, "scale", 3, "1 1 1")
     if min(scale) <= 0:
         raise UserError(f"{path}: mesh scale {mesh.get('scale')!r}, expected three numbers above 0")
-    transform = _transform(shape.find("origin"))
-    transform[:3, :3] *= np.array(scale)
+    origin = shape.find("origin")
+    transform = np.eye(4)
+    if origin is not None:
+        # Roll, pitch and yaw turn about fixed axes.
+        transform[:3, :3] = Rotation.from_euler("xyz", _numbers(origin, "rpy", 3, "0 0 0")).as_matrix()
+        transform[:3, 3] = _numbers(origin, "xyz", 3, "0 0 0")
+    transform[:3, :3] *= scale
     return found, transform
 
 
-def _transform(origin: ElementTree.Element | None) -> Array:
-    """Return the pose [4, 4] of a URDF `origin`: xyz, then roll, pitch, yaw about fixed axes."""
-    pose = np.eye(4)
-    if origin is None:
-        return pose
-    pose[:3, 3] = _numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
-    for angle, axis in zip(_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)), range(3), strict=True):
-        turn, (i, j) = np.eye(3), ((1, 2), (2, 0), (0, 1))[axis]
-        turn[i, i] = turn[j, j] = math.cos(angle)
-        turn[j, i], turn[i, j] = math.sin(angle), -math.sin(angle)
-        pose[:3, :3] = turn @ pose[:3, :3]
-    return pose
-
-
-def _numbers(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    if text is None:
-        return default
-    values = [float(word) for word in text.split()]
-    if len(values) != 3 or not all(math.isfinite(value) for value in values):
-        raise ValueError(f"expected three numbers, got {text!r}")
-    return values[0], values[1], values[2]
-
-
-def _number(element: ElementTree.Element | None) -> float | None:
-    return None if element is None else float(element.get("value", "nan"))
-
-
 def _color(link: ElementTree.Element, robot: ElementTree.Element) -> Color | None:
+    """Return the colour of a link's material, which may be defined with the robot."""
     material = link.find("visual/material")
     if material is None:
         return None
@@ -109,7 +88,18 @@ def _color(link: ElementTree.Element, robot: ElementTree.Element) -> Color | Non
     color = next((found for one in (material, *named) if (found := one.find("color")) is not None), None)
     if color is None:
         return None
-    values = [min(max(float(word), 0.0), 1.0) for word in color.get("rgba", "").split()]
-    if len(values) != 4:
-        raise ValueError(f"expected four numbers in rgba, got {color.get('rgba')!r}")
-    return values[0], values[1], values[2], values[3]
+    red, green, blue, alpha = np.clip(_numbers(color, "rgba", 4, ""), 0.0, 1.0).tolist()
+    return red, green, blue, alpha
+
+
+def _numbers(element: ElementTree.Element, name: str, count: int, default: str) -> list[float]:
+    """Return the finite numbers of an attribute.
+
+    Raises:
+        ValueError: there are others, or not `count`.
+    """
+    text = element.get(name, default)
+    values = [float(word) for word in text.split()]
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise ValueError(f"{name}: expected {count} numbers, got {text!r}")
+    return values

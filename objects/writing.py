@@ -1,14 +1,15 @@
-"""Writes object models as an object set: the meshes, the URDFs, and the manifest that names and hashes them."""
+"""Writes objects as an object set: the meshes, the URDFs, and the manifest that names and hashes them."""
 
+import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
 from tqdm import tqdm
 
 from graspq.common.errors import UserError
-from graspq.objects.export import obj_text, urdf_text
+from graspq.objects.mesh_files import obj_text, urdf_text
 from graspq.objects.model import ObjectModel
-from graspq.objects.object_set import ObjectRecord, ObjectSet, manifest_text, sha256_of_text
+from graspq.objects.object_set import ObjectRecord, ObjectSet, manifest_text, mesh_file, urdf_file
 from graspq.objects.publishing import MANIFEST, published
 
 
@@ -25,7 +26,7 @@ def write_object_set(
 
     Args:
         folder: where; missing, empty, or the same set.
-        models: the objects in the set's order; drawn one by one, so they need not all be in memory.
+        models: one or more objects in the set's order; drawn one by one, so they need not all be in memory.
         name: what the set is, such as "procedural".
         generator_version: version of the rules that made it, None for third-party meshes.
         seed: of the generator, None for third-party meshes.
@@ -35,12 +36,10 @@ def write_object_set(
         UserError: the folder holds something else or cannot be written; or what `models` raises. Nothing is then left.
     """
     _refuse_another_set(folder, (name, generator_version, seed))
-    with published(folder, what="object set") as temporary:
+    with published(folder) as temporary:
         (temporary / "meshes").mkdir()
         bar = tqdm(models, desc=f"{name} objects", total=total, unit="object", disable=None, leave=False)
         records = [_write_object(temporary, model) for model in bar]
-        if not records:
-            raise UserError(f"{folder}: no usable objects for the set; see the lines above")
         text = manifest_text(name=name, generator_version=generator_version, seed=seed, records=records)
         (temporary / MANIFEST).write_bytes(text.encode())
     return ObjectSet.load(folder)
@@ -57,10 +56,13 @@ def _refuse_another_set(folder: Path, wanted: tuple[str, str | None, int | None]
 
 
 def _write_object(folder: Path, model: ObjectModel) -> ObjectRecord:
-    mesh, urdf = f"meshes/{model.object_id}.obj", f"meshes/{model.object_id}.urdf"
-    texts = {mesh: obj_text(model), urdf: urdf_text(model, Path(mesh).name)}
-    for file, text in texts.items():
-        (folder / file).write_bytes(text.encode())
+    mesh, urdf = mesh_file(model.object_id), urdf_file(model.object_id)
+    contents = {
+        mesh: obj_text(model.object_id, model.parts).encode(),
+        urdf: urdf_text(model.object_id, mass=model.mass, inertia=model.inertia, color=model.color).encode(),
+    }
+    for file, content in contents.items():
+        (folder / file).write_bytes(content)
     return ObjectRecord(
         object_id=model.object_id,
         split=model.split,
@@ -69,9 +71,9 @@ def _write_object(folder: Path, model: ObjectModel) -> ObjectRecord:
         mass=model.mass,
         inertia=model.inertia,
         volume=model.volume,
-        extents=tuple(round(length, 7) for length in model.extents),  # type: ignore[arg-type]
+        extents=model.extents,
         parts=len(model.parts),
         mesh=mesh,
         urdf=urdf,
-        sha256={file: sha256_of_text(text) for file, text in texts.items()},
+        sha256={file: hashlib.sha256(content).hexdigest() for file, content in contents.items()},
     )

@@ -59,7 +59,7 @@ def load_objects(world: World, task: TaskSettings, objects: ObjectSet, object_id
     bodies = []
     for index, object_id in enumerate(object_ids):
         record = objects[object_id]
-        body = world.load_urdf(objects.folder / record.urdf, rigid=True, position=(index * 0.3, 0, -2.0))
+        body = world.load_urdf(objects.urdf_of(record.object_id), rigid=True, position=(index * 0.3, 0, -2.0))
         body.change_dynamics(
             lateralFriction=task.object_friction,
             spinningFriction=task.rolling_friction,

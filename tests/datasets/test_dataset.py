@@ -112,12 +112,16 @@ def test_a_block_is_read_without_copying_its_images(dataset):
     ("what", "change"),
     [
         ("tasks", {"task": {"name": "targeted", "max_steps": 15}}),
+        ("task settings", {"task": {"name": "regular", "max_steps": 12}}),
+        ("simulator versions", {"task": {"name": "regular", "max_steps": 15, "simulator_version": 2}}),
+        ("object sets", {"object_set": {"name": "drawn", "sha256": "1" * 64}}),
+        ("collection splits", {"settings": {"seed": 0, "block_size": 2, "split": "test"}}),
         ("action limits", {"action": grasping((0.1, 0.1, 0.1, 0.1))}),
         ("discounts", {"discount": 0.9}),
     ],
 )
 def test_datasets_that_differ_are_not_mixed(dataset, drawn, tmp_path, what, change):
-    manifest = dataclasses.replace(drawn.manifest(), **change)
+    manifest = dataclasses.replace(Manifest.load(dataset), shards=(), **change)
     commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 1, drawn.episodes(0, 1)))
     with pytest.raises(UserError, match=f"cannot mix {what}: .* has .* has ") as caught:
         open_shards([dataset, tmp_path])

@@ -1,4 +1,6 @@
+import gc
 import itertools
+import multiprocessing
 import threading
 
 import numpy as np
@@ -191,8 +193,54 @@ def test_closing_ends_the_thread_and_the_iteration(pool):
     next(loader)
     loader.close()
     loader.close()
-    assert not [thread for thread in threading.enumerate() if thread.name == "graspq-loader" and thread.is_alive()]
+    assert loader_threads() == []
     assert list(loader) == []
+
+
+def loader_threads():
+    return [thread for thread in threading.enumerate() if thread.name == "graspq-loader" and thread.is_alive()]
+
+
+def test_the_thread_starts_with_the_first_batch_and_ends_when_the_loader_is_dropped(pool):
+    loader = TransitionLoader(pool, 100, 0)
+    assert loader_threads() == []
+    next(loader)
+    (thread,) = loader_threads()
+    del loader
+    gc.collect()
+    thread.join(timeout=5)
+    assert not thread.is_alive()
+
+
+def in_a_fork(work):
+    """Return what `work` returns, or the error it raises as text, in a fork of this process."""
+
+    def told(sending):
+        try:
+            sending.send(work())
+        except Exception as error:
+            sending.send(repr(error))
+
+    receiving, sending = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=told, args=(sending,))
+    process.start()
+    try:
+        assert receiving.poll(20), "the fork hangs"
+        return receiving.recv()
+    finally:
+        process.kill()
+        process.join()
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork.*:DeprecationWarning")
+@pytest.mark.parametrize("prefetch", [0, 2])
+def test_a_fork_can_begin_a_loader_but_not_go_on_with_one(pool, prefetch):
+    with TransitionLoader(pool, 100, 0, prefetch=prefetch) as loader:
+        forked = in_a_fork(lambda: next(loader).episode_id)
+        assert np.array_equal(forked, next(loader).episode_id)
+        told = in_a_fork(lambda: next(loader).episode_id)
+        assert "RuntimeError" in told and "make the loader in the process that iterates it" in told
+        next(loader)
 
 
 def test_the_step_counts_the_batches_given_out(pool):

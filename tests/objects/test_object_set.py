@@ -1,7 +1,9 @@
 import json
 import shutil
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,6 +97,10 @@ def test_an_unknown_object_or_split_is_refused_with_what_there_is(small_set: Obj
         small_set.ids("validation")
 
 
+def _first(values: dict[str, object]) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    return lambda manifest: manifest | {"objects": [manifest["objects"][0] | values]}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -104,10 +110,14 @@ def test_an_unknown_object_or_split_is_refused_with_what_there_is(small_set: Obj
         (lambda values: values | {"objects": values["objects"][:1] * 2}, "ids of their own"),
         (lambda values: values | {"objects": [{"object_id": "x"}]}, "not a readable object set"),
         (lambda values: [1, 2], "not a readable object set"),
-        (
-            lambda values: values | {"objects": [values["objects"][0] | {"sha256": {"../../secret": "0"}}]},
-            "inside the set's folder",
-        ),
+        (_first({"sha256": {"../../secret": "0"}}), "expected the files meshes/train_000.obj and"),
+        (_first({"mesh": "/etc/passwd"}), "expected the files meshes/train_000.obj and"),
+        (_first({"object_id": "../x"}), "expected letters, digits"),
+        (_first({"split": 3}), "expected words"),
+        (_first({"mass": 0}), "expected sizes above 0"),
+        (_first({"mass": "heavy"}), "expected finite numbers"),
+        (_first({"inertia": [1e-5, float("nan"), 1e-5]}), "expected finite numbers"),
+        (_first({"color": [1, 0, 0]}), "expected finite numbers"),
     ],
 )
 def test_a_manifest_that_is_none_gives_one_clear_error(copied: ObjectSet, change: object, message: str) -> None:
@@ -120,13 +130,38 @@ def test_a_manifest_that_is_none_gives_one_clear_error(copied: ObjectSet, change
 def test_a_missing_or_corrupted_manifest_is_a_user_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no object set"):
         ObjectSet.load(tmp_path / "nowhere")
-    (tmp_path / "object_set.json").write_bytes(b'{"format_version": 1, "obj\xff')
-    with pytest.raises(UserError, match="not a readable object set"):
-        ObjectSet.load(tmp_path)
+    for content in (b'{"format_version": 1, "obj\xff', b"[" * 200_000, b'{"seed": ' + b"9" * 5000 + b"}"):
+        (tmp_path / "object_set.json").write_bytes(content)
+        with pytest.raises(UserError, match="not a readable object set"):
+            ObjectSet.load(tmp_path)
 
 
-@pytest.mark.parametrize("content", ["", "v 0 0\nf 1 2 3\n", "o a\nv 0 0 0\nf 1 2 9\n", "o a\nv x y z\n"])
+@pytest.mark.parametrize("name", ["meshes", "meshes/train_000.obj"])
+def test_a_link_to_files_elsewhere_is_refused(copied: ObjectSet, tmp_path: Path, name: str) -> None:
+    (copied.folder / name).rename(tmp_path / "elsewhere")
+    (copied.folder / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="a link is among them"):
+        ObjectSet.load(copied.folder)
+
+
+def test_a_simulator_is_given_a_urdf_that_says_what_the_record_says(copied: ObjectSet) -> None:
+    path = copied.urdf_of("train_000")
+    assert path == copied.folder / copied["train_000"].urdf
+    other = copied.folder / copied["train_001"].urdf
+    other.write_text(other.read_text().replace('filename="train_001.obj"', 'filename="../../secret.obj"'))
+    with pytest.raises(UserError, match=r"train_001\.urdf: says something else than object_set\.json"):
+        copied.urdf_of("train_001")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "v 0 0\nf 1 2 3\n", "o a\nv 0 0 0\nf 1 2 9\n", "o a\nv x y z\n", "o a\nv nan 0 0\nf 1 1 1\n",
+        "o a\nv 0 0 0\nf 1 1 3000000000\n", "o a\nv 0 0 0\nf 1 1 -1\n", f"o a\nv 0 0 0\nf 1 1 {'9' * 30}\n", "o a\n",
+    ],
+)  # fmt: skip
 def test_an_unreadable_mesh_is_a_user_error(copied: ObjectSet, content: str) -> None:
     (copied.folder / copied["train_000"].mesh).write_text(content)
-    with pytest.raises(UserError, match=r"train_000\.obj"):
-        copied.parts_of("train_000")
+    for read in (copied.parts_of, copied.urdf_of):
+        with pytest.raises(UserError, match=r"train_000\.obj"):
+            read("train_000")

@@ -1,6 +1,6 @@
 import collections
 import colorsys
-import time
+import hashlib
 from pathlib import Path
 
 import networkx
@@ -41,6 +41,12 @@ def test_seed_zero_is_a_seed_and_a_smaller_set_is_the_beginning_of_a_larger_one(
     for object_id in small.ids():
         assert small[object_id] == large[object_id]
     assert small.seed == 0
+
+
+def test_the_first_object_of_each_family_has_the_bytes_that_published_numbers_were_made_with(tmp_path: Path) -> None:
+    made = make_procedural(tmp_path / "set", seed=0, train=8, test=1)
+    digests = "".join(made[name].sha256[file] for name in made.ids("train") for file in sorted(made[name].sha256))
+    assert hashlib.sha256(digests.encode()).hexdigest().startswith("96fbbda6e7e3c14d")
 
 
 def test_the_splits_have_the_asked_sizes_and_share_no_object(small_set: ObjectSet) -> None:
@@ -151,13 +157,6 @@ def test_an_object_does_not_depend_on_the_others_made_before_it(small_set: Objec
     alone = procedural_object(SEED, "train", 17)
     assert alone.mass == small_set["train_017"].mass
     assert alone.inertia == small_set["train_017"].inertia
-
-
-def test_a_thousand_objects_take_less_than_a_minute_of_one_core() -> None:
-    start = time.process_time()
-    for index in range(40):
-        procedural_object(1, "train", index)
-    assert (time.process_time() - start) / 40 * 1000 < 60
 
 
 @pytest.mark.parametrize(("train", "test", "seed"), [(0, 1, 0), (1, 0, 0), (1, 1, -1)])

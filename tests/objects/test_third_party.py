@@ -6,7 +6,7 @@ import trimesh
 
 from graspq.common.errors import UserError
 from graspq.objects.geometry import half_spaces, union_mass_properties
-from graspq.objects.third_party import coarse_hull, import_meshes, split_of
+from graspq.objects.third_party import coarse_hull, import_meshes, splits_of
 
 BOX = (0.03, 0.05, 0.08)
 
@@ -122,14 +122,23 @@ def test_the_origin_and_turn_of_a_urdf_shape_place_its_mesh(source: Path, tmp_pa
     assert sorted(made["t"].extents) == pytest.approx([0.02, 0.06, 0.09], abs=1e-6)
 
 
-def test_the_split_is_the_papers_for_numbers_and_every_tenth_name_else() -> None:
-    numbers = [f"{index:03d}" for index in range(1000)]
-    held_out = [name for name in numbers if split_of(name, numbers) == "test"]
+def test_numbers_are_split_as_in_the_paper() -> None:
+    splits = splits_of([f"{index:03d}" for index in range(1000)])
+    held_out = [name for name, split in splits.items() if split == "test"]
     assert len(held_out) == 100
     assert all(name.endswith("0") for name in held_out)
-    names = [f"cup{index:02d}" for index in range(20)]
-    assert [name for name in names if split_of(name, names) == "test"] == ["cup00", "cup10"]
-    assert split_of("cup", ["cup"]) == "train"
+
+
+def test_a_tenth_of_other_names_is_held_out_and_an_added_object_moves_none_into_it() -> None:
+    names = [f"cup{index}" for index in range(400)]
+    assert 20 < list(splits_of(names).values()).count("test") < 60
+    known: dict[str, str] = splits_of(names[:2])
+    for count in range(3, 60):
+        splits = splits_of(sorted(names[:count]))
+        assert {"train", "test"} == set(splits.values())
+        assert not [name for name, split in known.items() if split == "train" and splits[name] == "test"]
+        known = splits
+    assert splits_of(["cup"]) == {"cup": "train"}
 
 
 def test_a_hull_of_many_corners_is_coarsened_to_within_2_percent_and_a_small_one_is_exact() -> None:
@@ -165,7 +174,8 @@ def test_a_mesh_of_three_metres_is_refused_and_the_advised_scale_works(source: P
         ("index.obj", "v 0 0 0\nv 0.1 0 0\nf 1 2 9\n", "index.obj"),
         ("broken.urdf", "<robot><link>", "not a readable URDF"),
         ("none.urdf", "<robot/>", "expected one rigid body, found 0"),
-        ("lost.urdf", _urdf("lost.obj"), "names the mesh 'lost.obj', which is not there"),
+        ("lost.urdf", _urdf("lost.obj"), "names the mesh 'lost.obj', which is not in"),
+        ("away.urdf", _urdf("../secret.obj"), "names the mesh '../secret.obj', which is not in"),
         ("scale.urdf", _urdf("scale.urdf", "0 1 1"), "expected three numbers above 0"),
         ("scale.urdf", _urdf("scale.urdf", "one"), "not a readable URDF"),
         ("arm.urdf", _urdf("a.obj", extra="<link name='y'><visual/></link>"), "found 2 links"),
@@ -175,24 +185,30 @@ def test_an_unusable_file_is_one_line_that_names_it_and_leaves_nothing(
     source: Path, tmp_path: Path, name: str, content: str, message: str
 ) -> None:
     (source / name).write_text(content)
+    trimesh.creation.box(BOX).export(tmp_path / "secret.obj")
     with pytest.raises(UserError, match=message) as refused:
         import_meshes(source, tmp_path / "set")
     assert name in refused.value.message
     assert "\n" not in refused.value.message
-    assert [path.name for path in tmp_path.iterdir()] == ["meshes"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["meshes", "secret.obj"]
 
 
-def test_unusable_objects_can_be_left_out_with_a_line_each(source: Path, tmp_path: Path) -> None:
+def test_unusable_objects_are_left_out_with_a_line_each(source: Path, tmp_path: Path) -> None:
     trimesh.creation.box(BOX).export(source / "good.stl")
     (source / "bad.obj").write_text("")
     lines: list[str] = []
-    made = import_meshes(source, tmp_path / "set", skip=lines.append)
+    made = import_meshes(source, tmp_path / "set", left_out=lines.append)
     assert made.ids() == ("good",)
     assert len(lines) == 1
-    assert "bad.obj" in lines[0]
-    (source / "good.stl").unlink()
-    with pytest.raises(UserError, match="no usable objects"):
-        import_meshes(source, tmp_path / "none", skip=lines.append)
+    assert "left out" in lines[0] and "bad.obj" in lines[0]
+
+
+def test_where_none_can_be_used_the_first_is_named(source: Path, tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        trimesh.creation.box((30, 40, 50)).export(source / f"{name}.stl")
+    with pytest.raises(UserError, match=r"a\.stl: longest side 50 m.*--scale 0\.001 \(and 2 others cannot be used"):
+        import_meshes(source, tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
 def test_missing_and_empty_folders_and_odd_numbers_are_refused(source: Path, tmp_path: Path) -> None:
