@@ -34,7 +34,7 @@ PARTS = {
     "training": "training --shards {shards}",
     "estimators": "estimators --shards {shards}",
     "decision": "decision",
-    "evaluation": "evaluation {run} --episodes 512 --rival-episodes 128",
+    "evaluation": "evaluation_speed {run} --episodes 512 --rival-episodes 128",
     "time_to_quality": "time_to_quality --shards {shards} --seeds 3 --work {work}",
 }
 PUBLISHED_TABLES = ("Where a grasp's time goes", "Where a training step's time goes")
@@ -129,7 +129,7 @@ def processor() -> str:
 def main(settings: BenchSettings) -> None:
     """Run the benchmarks that are not done yet, and write their figures and the table of ratios."""
     settings.work.mkdir(parents=True, exist_ok=True)
-    published = read_json(settings.out, "benchmarks' figures")["parts"] if settings.out.exists() else {}
+    published = read_json(settings.out, "benchmarks' figures") if settings.out.exists() else {"parts": {}}
     found: dict[str, dict[str, Any]] = {}
     commands: dict[str, str] = {}
     for name, template in PARTS.items():
@@ -138,8 +138,8 @@ def main(settings: BenchSettings) -> None:
         commands[name] = f"python benchmarks/{words[0]}.py {' '.join(words[1:])}".strip()
         if name in (settings.part or PARTS) or name in settings.again:
             found[name] = measured(name, words, settings.work, name in settings.again)
-        elif name in published:
-            found[name] = published[name]
+        elif name in published["parts"]:
+            found[name], commands[name] = published["parts"][name], published["commands"][name]
     where = f"{processor()}, {available_cores()} cores"
     write_json(settings.out, {"machine": where, "commands": commands, "parts": found})
     facts = f"{where}. Every figure, with the day and the code of each part: [{settings.out}]({settings.out})."

@@ -7,10 +7,9 @@ targets, forward, backward and optimiser, as `grasp-train` runs them with defaul
 """
 
 import contextlib
-import statistics
 from dataclasses import dataclass
 
-from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, median_ratio, take_turns
+from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, compared, take_turns
 from graspq.benchmarks.sessions import ready, steps_on, training_of, update_of
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
@@ -35,12 +34,7 @@ def measure(settings: EstimatorsSettings) -> Result:
             runs[name] = steps_on(batches, update_of(current))
             real[name] = sum(int(batch.real_steps.sum()) for batch in batches)
         seconds = take_turns(runs, settings.turns)
-    pace = {name: [value / real[name] for value in values] for name, values in seconds.items()}
-    times = {name: median_ratio(pace["mc"], values) for name, values in pace.items()}
-    rows = [
-        {"estimator": name, "transitions a second": 1 / statistics.median(values), "times mc": times[name]}
-        for name, values in pace.items()
-    ]
+    rows, times = compared("estimator", "transitions", seconds, real, "mc")
     return Result(
         [
             Ratio("transitions a second of `dql`, against `mc`", times["dql"], bar=0.5),

@@ -11,7 +11,6 @@ a rival's first batch is looked up in the data. Rivals need Hugging Face `datase
 
 import contextlib
 import itertools
-import statistics
 import tempfile
 import zlib
 from collections.abc import Callable, Iterable
@@ -24,7 +23,7 @@ import numpy as np
 import torch
 
 from graspq.benchmarks import loading_rivals as rivals
-from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, median_ratio, take_turns
+from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, compared, take_turns
 from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
@@ -148,16 +147,11 @@ def measure(settings: LoadingSettings) -> Result:
         CHECKED: ours(lambda: larger(open_shards(settings.shards), size)[0], size, batches, buffer_bytes),
         IN_MEMORY: ours(lambda: pool, size, batches, 2 * pool.rows * pool.row_bytes),
     }
-    samples = dict.fromkeys(runs, size * batches)
+    counts = dict.fromkeys(runs, size * batches) | dict.fromkeys(RIVALS, size * rival_batches)
     with tempfile.TemporaryDirectory(prefix="graspq-loading-") as temporary:
         runs |= rival_runs(pool, settings.scratch or Path(temporary), rival_batches, settings)
         seconds = take_turns(runs, settings.turns)
-    pace = {name: [one / samples.get(name, size * rival_batches) for one in values] for name, values in seconds.items()}
-    times = {name: median_ratio(pace[PNG], values) for name, values in pace.items()}
-    rows = [
-        {"loader": name, "samples a second": 1 / statistics.median(values), "times PNG files": times[name]}
-        for name, values in pace.items()
-    ]
+    rows, times = compared("loader", "samples", seconds, counts, PNG)
     return Result(
         [
             Ratio("shuffled transitions from disk, against PNG + `DataLoader`", times[STREAMING], bar=10, aim=30),

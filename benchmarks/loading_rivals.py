@@ -74,10 +74,14 @@ class PngFiles(Dataset[Batch]):
         return pictures | {name: torch.as_tensor(values[row]) for name, values in self.frames.columns.items()}
 
 
+def shuffled(dataset: Dataset[Batch], batch_size: int, workers: int, **more: Any) -> Epoch:
+    """Return an epoch's factory: PyTorch's own `DataLoader`, shuffled over all rows."""
+    return lambda: DataLoader(dataset, batch_size, shuffle=True, num_workers=workers, drop_last=True, **more)
+
+
 def png_files(frames: Frames, folder: Path, batch_size: int, workers: int) -> Epoch:
-    """A PyTorch `Dataset` over PNG files with PyTorch's own `DataLoader`."""
-    dataset = PngFiles(frames, folder)
-    return lambda: DataLoader(dataset, batch_size, shuffle=True, num_workers=workers, drop_last=True)
+    """PNG files with PyTorch's own loader."""
+    return shuffled(PngFiles(frames, folder), batch_size, workers)
 
 
 def shard_files(pool: ShardPool) -> list[str]:
@@ -118,10 +122,7 @@ def hugging_face_map(frames: Frames, folder: Path, batch_size: int, workers: int
     datasets.disable_progress_bars()
     files = shard_files(frames.pool)
     rows = datasets.load_dataset("parquet", data_files=files, split="train", cache_dir=str(folder))
-    dataset = MapStyleRows(rows, frames)
-    return lambda: DataLoader(
-        dataset, batch_size, shuffle=True, num_workers=workers, drop_last=True, collate_fn=lambda batch: batch
-    )
+    return shuffled(MapStyleRows(rows, frames), batch_size, workers, collate_fn=lambda batch: batch)
 
 
 class Pairs:
@@ -209,5 +210,4 @@ def to_tensors(batch: dict[str, list[Any]]) -> dict[str, list[Tensor]]:
 
 def lerobot_style(frames: Frames, folder: Path, batch_size: int, workers: int) -> Epoch:
     """LeRobot-style random access with PyTorch's own loader."""
-    dataset = LeRobotRows(frames, folder)
-    return lambda: DataLoader(dataset, batch_size, shuffle=True, num_workers=workers, drop_last=True)
+    return shuffled(LeRobotRows(frames, folder), batch_size, workers)

@@ -153,6 +153,27 @@ def median_ratio(over: Sequence[float], under: Sequence[float]) -> float:
     return statistics.median(a / b for a, b in zip(over, under, strict=True))
 
 
+def compared(
+    what: str, unit: str, seconds: Mapping[str, Sequence[float]], counts: Mapping[str, int], against: str
+) -> tuple[list[Row], dict[str, float]]:
+    """Return a row for each rival, and how many times as fast as one of them it is.
+
+    Args:
+        what: heading of the rivals' names.
+        unit: what is counted, such as `samples`.
+        seconds: of every rival in every turn.
+        counts: units that a rival does in a turn.
+        against: name of the rival that all are held against.
+    """
+    pace = {name: [value / counts[name] for value in values] for name, values in seconds.items()}
+    times = {name: median_ratio(pace[against], values) for name, values in pace.items()}
+    rows = [
+        {what: name, f"{unit} a second": 1 / statistics.median(values), f"times {against}": times[name]}
+        for name, values in pace.items()
+    ]
+    return rows, times
+
+
 def greatest_difference(expected: Any, others: Mapping[str, Any]) -> float:
     """Return how far any rival's tensor lies from ours, at most.
 

@@ -29,8 +29,8 @@ from graspq.benchmarks.measuring import (
     Row,
     TrainingSpeedSettings,
     command,
+    compared,
     greatest_difference,
-    median_ratio,
     take_turns,
 )
 from graspq.benchmarks.plain_pytorch import PlainTraining, augmented, plain_copy
@@ -164,33 +164,27 @@ def measure(settings: TrainingSettings) -> Result:
     torch.manual_seed(0)
     rows: list[Row] = []
     pieces: list[Row] = []
-    times: dict[tuple[str, str], float] = {}
+    faster: dict[tuple[str, str], float] = {}
     # One estimator after the other: a turn of ours and one of its rival then lie within seconds of each other.
     for algo in ("mc", "dql", "ddpg"):
         with training_of(algo, pool, settings) as current:
             batches = ready(current, pool, settings.steps)
             runs = rivals_of(current, batches)
             seconds = take_turns({name: run for name, (run, _) in runs.items()}, settings.turns)
-            pace = {name: [value / runs[name][1] for value in values] for name, values in seconds.items()}
-            times |= {(algo, name): median_ratio(values, pace[OURS]) for name, values in pace.items()}
+            counts = {name: count for name, (_, count) in runs.items()}
+            found, times = compared("training", "transitions", seconds, counts, OURS)
             if algo != "ddpg":
                 pieces.append(pieces_row(current, batches[:1] + batches * settings.turns))
             precision = current.state.networks.precision.name
-        rows += [
-            {
-                "training": f"{algo}, {name}",
-                "transitions a second": 1 / statistics.median(values),
-                "graspq is faster, times": times[algo, name],
-            }
-            for name, values in pace.items()
-        ]
+        rows += [{**row, "training": f"{algo}, {row['training']}"} for row in found]
+        faster |= {(algo, name): 1 / value for name, value in times.items()}
     tiled = "… of `dql`, the plain one with a copy of the picture for every candidate"
     return Result(
         [
-            Ratio("training of `mc`, against the same network in plain PyTorch", times["mc", PLAIN], bar=2, aim=4),
-            Ratio("… of `dql`", times["dql", PLAIN], bar=2, aim=4),
-            Ratio(tiled, times["dql", TILED]),
-            Ratio("… of `ddpg`, against d3rlpy's own, smaller network", times.get(("ddpg", D3RLPY))),
+            Ratio("training of `mc`, against the same network in plain PyTorch", faster["mc", PLAIN], bar=2, aim=4),
+            Ratio("… of `dql`", faster["dql", PLAIN], bar=2, aim=4),
+            Ratio(tiled, faster["dql", TILED]),
+            Ratio("… of `ddpg`, against d3rlpy's own, smaller network", faster.get(("ddpg", D3RLPY))),
         ],
         {"Training speed on a CPU": rows, "Where a training step's time goes": pieces},
         {"threads": torch.get_num_threads(), "our precision": precision},

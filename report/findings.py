@@ -25,7 +25,7 @@ RUN_FILE = "config.json"
 REFERENCES = (RANDOM, ORACLE)
 
 
-class Scenes(NamedTuple):
+class PanelKey(NamedTuple):
     """What must agree for two success rates to stand side by side.
 
     Attributes:
@@ -141,13 +141,13 @@ class Findings:
 
     Attributes:
         runs: training runs, in the order they were found.
-        panels: scenes → scores on them, the references at the ends.
+        panels: what their scores have in common → scores, the references at the ends.
         sweeps: sweeps of many runs; of these runs, `runs` and `panels` hold the best of each estimator.
         evaluations: every evaluation that a score uses.
     """
 
     runs: list[RunData]
-    panels: dict[Scenes, list[Score]]
+    panels: dict[PanelKey, list[Score]]
     sweeps: list[Sweep] = field(default_factory=list)
 
     @property
@@ -185,19 +185,19 @@ def gather(folders: Sequence[Path], baselines: Path | None) -> Findings:
         paths.pop(left_out, None)
         evaluations = {path: one for path, one in evaluations.items() if left_out not in path.parents}
     if baselines is not None and baselines.is_dir():
-        shown = {_scenes(one) for one in evaluations.values()}
+        shown = {_panel_key(one) for one in evaluations.values()}
         for one in find_evaluations(baselines):
-            if not shown or _scenes(one) in shown:
+            if not shown or _panel_key(one) in shown:
                 evaluations.setdefault(one.folder.resolve(), one)
     runs = [_read_run(path, name) for path, name in zip(paths, _names(list(paths)), strict=True)]
     panels = _panels(list(evaluations.values()), {run.folder: run.name for run in runs})
     return Findings(runs, panels, list(sweeps.values()))
 
 
-def _scenes(evaluation: Evaluation) -> Scenes:
+def _panel_key(evaluation: Evaluation) -> PanelKey:
     summary = evaluation.summary
     settings = identity_digest(summary["job"].get("task", {}))
-    return Scenes(summary["task"], summary["split"], summary.get("object_set", {}).get("sha256", ""), settings)
+    return PanelKey(summary["task"], summary["split"], summary.get("object_set", {}).get("sha256", ""), settings)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -219,14 +219,14 @@ def _read_run(folder: Path, name: str) -> RunData:
     return RunData(folder, name, run.config, run.metrics())
 
 
-def _panels(evaluations: Sequence[Evaluation], names: dict[Path, str]) -> dict[Scenes, list[Score]]:
+def _panels(evaluations: Sequence[Evaluation], names: dict[Path, str]) -> dict[PanelKey, list[Score]]:
     """Group evaluations by scenes, and within by policy; of two with the same seed the longer one counts."""
-    grouped: dict[Scenes, dict[tuple[str, str], dict[int, Evaluation]]] = defaultdict(dict)
+    grouped: dict[PanelKey, dict[tuple[str, str], dict[int, Evaluation]]] = defaultdict(dict)
     for one in evaluations:
         summary = one.summary
         settings = {**summary["job"], "seed": None, "episodes": None}
         key = (_run_name(one, names), json.dumps(settings, sort_keys=True))
-        seeds = grouped[_scenes(one)].setdefault(key, {})
+        seeds = grouped[_panel_key(one)].setdefault(key, {})
         best = seeds.get(summary["seed"])
         if best is None or best.summary["episodes"] < summary["episodes"]:
             seeds[summary["seed"]] = one

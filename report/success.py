@@ -6,7 +6,7 @@ from typing import Any
 
 from graspq.evaluate.records import ORACLE, RANDOM, Evaluation
 from graspq.evaluate.statistics import mean_over_seeds
-from graspq.report.findings import RunData, Scenes, Score, comparisons
+from graspq.report.findings import PanelKey, RunData, Score, comparisons
 
 REFERENCE_COLORS = {RANDOM: 8, ORACLE: 9}
 PER_RUN = ("seed", "out")  # settings in which runs of one experiment may differ
@@ -27,7 +27,7 @@ def set_name(summary: dict[str, Any]) -> str:
     return str(summary.get("object_set", {}).get("name", "unknown"))
 
 
-def panel_of(key: Scenes, scores: Sequence[Score], runs: Sequence[RunData], colors: dict[str, int]) -> dict[str, Any]:
+def panel_of(key: PanelKey, scores: Sequence[Score], runs: Sequence[RunData], colors: dict[str, int]) -> dict[str, Any]:
     """Return a panel of success: bars, differences, means over training seeds."""
     counts = sorted({score.episodes for score in scores})
     episodes = f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,} to {counts[-1]:,}"

@@ -21,7 +21,9 @@ def place(tmp_path: Path) -> Path:
     (tmp_path / "page.md").write_text(f"before\n{bench.BEGIN}\nold\n{bench.END}\nafter\n")
     (tmp_path / "work").mkdir()
     published = {"decision": figures(20.0), "estimators": figures(5.0)}
-    (tmp_path / "bench.json").write_text(json.dumps({"parts": published}))
+    (tmp_path / "bench.json").write_text(
+        json.dumps({"parts": published, "commands": dict.fromkeys(published, "as it was")})
+    )
     return tmp_path
 
 
@@ -48,6 +50,7 @@ def test_a_finished_part_is_not_run_again_and_one_that_is_not_asked_for_stays_as
     text = (place / "page.md").read_text()
     assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
     assert "| x against y | 30 | ≥ 4 |  | yes | `python benchmarks/decision.py` |" in text
+    assert "| x against y | 5 | ≥ 4 |  | yes | `as it was` |" in text
     assert text.count("`python benchmarks/decision.py`") == 1, "the command stands at a part's first line alone"
 
 

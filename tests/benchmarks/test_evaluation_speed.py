@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from graspq.benchmarks.evaluation import check_rivals, one_at_a_time, together
+from graspq.benchmarks.evaluation_speed import check_rivals, one_at_a_time, together
 from graspq.benchmarks.rivals import ONCE, TILED, WAYS, asking
 from graspq.common.errors import UserError
 from graspq.evaluate.rollout import Rollouts
