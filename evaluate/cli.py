@@ -28,7 +28,7 @@ RESULTS = Path("runs/evaluations")
 def main(settings: EvalSettings) -> int:
     """Score policies in simulation on held-out objects.
 
-    Each RUN is a folder of grasp-train (or a glob of them); its last checkpoint acts by the cross-entropy method.
+    Each RUN is a folder of grasp-train (or a glob of them); its last checkpoint acts as its estimator does.
     Every policy meets the same scenes, and a result does not depend on the number of workers. Each evaluation is a
     folder with eval.json, episodes.jsonl and films.npz; several jobs also give one table, results.jsonl and
     results.csv. A job that is finished is not run again.
