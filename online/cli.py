@@ -5,19 +5,41 @@ The way on: `plan` (what a command line means) -> `run` (the rounds) -> `growth`
 
 import importlib.util
 import os
+from typing import Any
 
 import click
 
 from graspq.common.errors import UserError
-from graspq.common.options import Command, Settings, options_from, with_version
-from graspq.online.settings import OnlineOptions
+from graspq.common.options import given_options, parameters, with_version
+from graspq.online.settings import OnlineSettings
+from graspq.train.cli import TrainingCommand, value_of
 from graspq.train.run import Run
 
 
-@click.command(cls=Command)
+class OnlineCommand(TrainingCommand):
+    """The options of the rounds, and those of training: of the `--algo` that is given, or of the start run's."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse; a start run says which estimator and networks the options are of."""
+        start = value_of("--start", args)
+        if start is not None:
+            settings = Run.open(start).config["settings"]
+            for option in ("--algo", "--network"):
+                if value_of(option, args) is None:
+                    args = [*args, option, str(settings.get(option[2:]))]
+        return super().parse_args(ctx, args)
+
+    def groups(self, ctx: click.Context) -> list[tuple[str, list[click.Parameter]]]:
+        """Return the groups of options; the rounds say how many steps there are."""
+        (name, first), *others = super().groups(ctx)
+        rounds = ("Rounds", parameters(OnlineSettings))
+        return [rounds, (name, [one for one in first if one.name != "steps"]), *others]
+
+
+@click.command(cls=OnlineCommand)
 @with_version
-@options_from(OnlineOptions)
-def main(options: Settings) -> None:
+@click.pass_context
+def main(context: click.Context, /, **_: Any) -> None:
     """Alternate training with fresh grasps of the latest policy: `grasp-online --start runs/dql-regular-10k-seed0`.
 
     Each round first collects --grasps with the policy as it stands, a random action taking the place of the policy's
@@ -36,10 +58,11 @@ def main(options: Settings) -> None:
         raise UserError("grasp-online needs the simulator, PyBullet is not installed; run: pip install 'graspq[sim]'")
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UserError("grasp-online runs in one process, WORLD_SIZE says several; start it without torchrun")
+    # Imported late: --help must not wait for the simulator.
     from graspq.online.plan import resolve
     from graspq.online.run import run_online
 
-    plan = resolve(options)
+    plan = resolve(given_options(context))
     click.echo(f"{plan.train.algo}: {plan.train.run_folder}", err=True)
     click.echo(_summary(run_online(plan, show_progress=True)))
 

@@ -4,16 +4,17 @@ Nothing is opened for writing here.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.common.options import Settings, flag
-from graspq.online.settings import FIXED_BY_START, OnlineSettings
+from graspq.common.options import flag
+from graspq.online.settings import OnlineSettings
 from graspq.train.checkpoint import STATE_FILE, describe
 from graspq.train.run import Run
-from graspq.train.settings import TrainSettings, preset_values
+from graspq.train.settings import TrainSettings, complete, with_options
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,54 +88,55 @@ class Plan:
         return self.online.deciding() | {"start": start, "split_seed": self.split_seed}
 
 
-def resolve(options: Settings) -> Plan:
+def resolve(given: Mapping[str, Any]) -> Plan:
     """Return the plan of a command line.
 
     Args:
-        options: `OnlineOptions`.
+        given: options by name: those of `OnlineSettings`, those of `grasp-train` but for `steps`, and `preset`.
 
     Raises:
         UserError: a value is unknown or does not go with the start run, or that is not there.
     """
-    names = [field.name for field in dataclasses.fields(OnlineSettings)]
-    online = OnlineSettings(**{name: getattr(options, name) for name in names})
-    others = [field.name for field in dataclasses.fields(options) if field.name not in names]
-    given = {name: getattr(options, name) for name in others if getattr(options, name) not in (None, ())}
+    own = {field.name for field in dataclasses.fields(OnlineSettings)}
+    online = OnlineSettings(**{name: value for name, value in given.items() if name in own})
+    training = {name: value for name, value in given.items() if name not in own}
+    steps = online.rounds * online.steps_per_round
     if online.start is None:
         if online.checkpoint is not None:
             raise UserError("--checkpoint: is that of a start run; give --start too")
-        start, values = None, _from_scratch(given)
+        start, train = None, _from_scratch(training, steps)
     else:
         start = Start.open(online.start, online.checkpoint)
-        values = _going_on(start, given)
-    first = 0 if start is None else start.step
-    train = TrainSettings(**values, steps=first + online.rounds * online.steps_per_round)
+        train = _going_on(start, training, start.step + steps)
     if train.out is None:
         named = train.run_folder
         train = dataclasses.replace(train, out=named.with_name(f"online-{named.name}"))
     return Plan(online, train, start)
 
 
-def _from_scratch(given: dict[str, Any]) -> dict[str, Any]:
+def _from_scratch(given: Mapping[str, Any], steps: int) -> TrainSettings:
     for name in ("algo", "shards"):
         if name not in given:
             raise UserError(f"{flag(name)}: is needed from scratch; give it, or a run to go on from with --start")
-    values = preset_values(given.get("preset", "default"), given["algo"]) | {"schedule": "constant"} | given
-    return {name: value for name, value in values.items() if name != "steps"}
+    options = {"schedule": "constant"} | {name: value for name, value in given.items() if name != "preset"}
+    return complete(options | {"steps": steps}, given.get("preset", "default"))
 
 
-def _going_on(start: Start, given: dict[str, Any]) -> dict[str, Any]:
+def _going_on(start: Start, given: Mapping[str, Any], steps: int) -> TrainSettings:
     before = start.settings
-    for name in FIXED_BY_START:
-        theirs = getattr(before, name, None)
+    if "preset" in given:
+        raise UserError(f"--preset: {start.folder} has its settings already; leave the option out, or --start")
+    # What the weights were trained with cannot change on the way.
+    fixed = {"algo": before.algo, "network": before.network, **before.network_own.to_json()}
+    fixed |= {"loss": before.own.loss} if hasattr(before.own, "loss") else {}
+    for name, theirs in fixed.items():
         if name in given and given[name] != theirs:
             raise UserError(
                 f"{flag(name)}: {start.folder} was trained with {theirs}, got {given[name]}; "
                 "leave the option out, or train from scratch without --start"
             )
     rate = before.learning_rate if before.schedule == "constant" else before.learning_rate / 10
-    kept = {field.name: getattr(before, field.name) for field in dataclasses.fields(before)}
     # What rose over the start run's steps stays risen: the rate, and the correction of corr-mc.
-    onward = {"out": None, "schedule": "constant", "warmup": 0.0, "learning_rate": rate, "anneal": 0.0}
-    values = kept | onward | given
-    return {name: value for name, value in values.items() if name != "steps"}
+    onward: dict[str, Any] = {"out": None, "schedule": "constant", "warmup": 0.0, "learning_rate": rate}
+    onward |= {"anneal": 0.0} if hasattr(before.own, "anneal") else {}
+    return with_options(before, onward | dict(given) | {"steps": steps})

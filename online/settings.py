@@ -1,10 +1,6 @@
-"""Settings of `grasp-online`: those of the rounds, and with them all of `grasp-train`'s.
-
-`OnlineOptions` is what a command line gives; `plan.resolve` makes complete settings of it.
-"""
+"""Settings of the rounds of `grasp-online`; those of training stand beside them (`plan`)."""
 
 import dataclasses
-import typing
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +8,9 @@ from graspq.common.options import parse_count, setting
 from graspq.engine import EngineSettings
 from graspq.engine.settings import ENGINE_OPTIONS
 from graspq.train.selection import Answer, CemSettings
-from graspq.train.settings import TrainOptions, TrainSettings
 
 # They may differ when a run is resumed: they do not decide what is collected.
 FREE_SETTINGS = ENGINE_OPTIONS | {"start", "checkpoint", "objects"}
-
-_HELP = {
-    "algo": "Estimator; that of the start run where it is not given.",
-    "shards": "Base pool: dataset folders, shard files or globs; those of the start run where not given.",
-    "out": "Run folder; runs/online-ALGO-DATASET-seedSEED where it is not given.",
-    "seed": "Seed of weights, order, augmentation, candidates, scenes and exploration; 0, or the start run's.",
-    "learning_rate": (
-        "Highest learning rate of AdamW; with --start that run's where its schedule was constant, else a tenth of it."
-    ),
-    "schedule": "Learning rate after warming up; constant where it is not given; cosine falls to 0 at the last round.",
-    "warmup": (
-        "Part of all steps in which the learning rate rises linearly, 0 to 1; 0 with --start, else the preset's."
-    ),
-    "anneal": (
-        "Part of all steps over which the correction of corr-mc rises from 0 to 1; 0, that is all at once, with "
-        "--start, else the preset's."
-    ),
-}
-# Of the run that is gone on from, not to be changed on the way.
-FIXED_BY_START = ("algo", "preset", "network", "width", "loss")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,30 +84,3 @@ class OnlineSettings(EngineSettings):
     def deciding(self) -> dict[str, Any]:
         """Return the settings that decide what is collected, as JSON."""
         return {name: value for name, value in self.to_json().items() if name not in FREE_SETTINGS}
-
-
-def _options_type() -> type[OnlineSettings]:
-    """Return the dataclass of the command line: the settings of the rounds, and of training with None as default."""
-    hints = typing.get_type_hints(TrainSettings)
-    shown = {field.name: field for field in dataclasses.fields(TrainOptions)}
-    fields: list[Any] = []
-    for field in dataclasses.fields(TrainSettings):
-        if field.name == "steps":
-            continue
-        several = typing.get_origin(hints[field.name]) is tuple
-        hint = hints[field.name] if several else hints[field.name] | None
-        text = _HELP.get(field.name) or _with_default(shown[field.name])
-        metadata = {**field.metadata, "help": text}
-        fields.append((field.name, hint, dataclasses.field(default=() if several else None, metadata=metadata)))
-    made: type[OnlineSettings] = dataclasses.make_dataclass(
-        "OnlineOptions", fields, bases=(OnlineSettings,), frozen=True
-    )
-    return made
-
-
-def _with_default(field: "dataclasses.Field[Any]") -> str:
-    text: str = field.metadata["help"]
-    return text if field.default is None or text.endswith("]") else f"{text} [default: {field.default}]"
-
-
-OnlineOptions = _options_type()

@@ -78,18 +78,22 @@ class TrainingCommand(Command):
                 formatter.write_dl([(name, f"{row.summary}.") for name, row in ESTIMATORS.items()])
 
 
+def value_of(option: str, words: Sequence[str]) -> str | None:
+    """Return the value that a command line's words give to an option, the last where it stands twice."""
+    found = None
+    for word, following in zip(words, [*words[1:], None], strict=True):
+        name, equals, value = word.partition("=")
+        if name == option:
+            found = value if equals else following
+    return found
+
+
 def _chosen(words: Sequence[str]) -> tuple[str | None, str]:
     """Return the values of `--algo` and `--network` in a command line, as they decide which options there are."""
-    found = {"--preset": "default"}
-    for word, following in zip(words, [*words[1:], ""], strict=True):
-        name, equals, value = word.partition("=")
-        if name in ("--algo", "--network", "--preset"):
-            found[name] = value if equals else following
-    algo = found.get("--algo")
-    recipe = Recipe()
-    if found["--preset"] == "paper":
+    algo, recipe = value_of("--algo", words), Recipe()
+    if value_of("--preset", words) == "paper":
         recipe = estimator_named(algo).paper_recipe if algo is not None else PAPER
-    return algo, found.get("--network", recipe.network)
+    return algo, value_of("--network", words) or recipe.network
 
 
 @click.command(cls=TrainingCommand)

@@ -109,7 +109,21 @@ def complete(given: Mapping[str, Any], preset: Preset = "default") -> TrainSetti
     network = given.get("network", recipe.network)
     own, network_own = row.paper if preset == "paper" else row.settings(), network_named(network).settings()
     values: dict[str, Any] = {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)}
-    kinds = {"own": own, "network_own": network_own}
+    return _changed(values | {"network": network}, {"own": own, "network_own": network_own}, given)
+
+
+def with_options(settings: TrainSettings, given: Mapping[str, Any]) -> TrainSettings:
+    """Return settings with some options changed: common ones, the estimator's and the networks', but not which.
+
+    Raises:
+        UserError: an option is unknown or belongs to another estimator or network, or a value is out of range.
+    """
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    kinds = {name: values.pop(name) for name in NESTED}
+    return _changed(values, kinds, given)
+
+
+def _changed(values: dict[str, Any], kinds: Mapping[str, Settings], given: Mapping[str, Any]) -> TrainSettings:
     places = {field.name: place for place, kind in kinds.items() for field in dataclasses.fields(kind)}
     common = {field.name for field in dataclasses.fields(TrainSettings)} - set(NESTED)
     changed: dict[str, dict[str, Any]] = {place: {} for place in kinds}
@@ -119,7 +133,7 @@ def complete(given: Mapping[str, Any], preset: Preset = "default") -> TrainSetti
         elif name in places:
             changed[places[name]][name] = value
         else:
-            raise UserError(unknown_option(flag(name), given["algo"], network))
+            raise UserError(unknown_option(flag(name), given.get("algo", values.get("algo")), values["network"]))
     replaced = {place: dataclasses.replace(kind, **changed[place]) for place, kind in kinds.items()}
     return TrainSettings(**values | replaced)
 

@@ -9,9 +9,8 @@ import torch
 
 from graspq.objects.object_set import ObjectSet
 from graspq.online.plan import Plan, resolve
-from graspq.online.settings import OnlineOptions
 from graspq.train.loop import train
-from graspq.train.settings import preset_settings
+from graspq.train.settings import complete
 
 BLOCKS, BLOCK_SIZE = 8, 5
 
@@ -34,13 +33,9 @@ def base(
 def start(base: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of `dql` with a small network, six steps long."""
     folder = tmp_path_factory.mktemp("runs") / "start"
-    train(
-        preset_settings(
-            "paper", algo="dql", shards=(str(base),), out=folder, steps=6, batch_size=8, width=8, log_every=2,
-            average_decay=0.9, validation_fraction=0.3, validate_every=4, checkpoint_every=3, lag_steps=4,
-            device="cpu", threads=1,
-        )
-    )  # fmt: skip
+    small = {"batch_size": 8, "width": 8, "average_decay": 0.9, "lag_steps": 4, "validation_fraction": 0.3}
+    this = {"algo": "dql", "shards": (str(base),), "out": folder, "steps": 6, "save_every": 3}
+    train(complete(this | small | {"device": "cpu", "threads": 1}, "paper"))
     return folder
 
 
@@ -53,6 +48,6 @@ def make_plan(start: Path) -> MakePlan:
 
     def make(out: Path, **given: Any) -> Plan:
         short = {"start": start, "rounds": 3, "grasps": 2, "steps_per_round": 6, "exploration_steps": 20, "workers": 0}
-        return resolve(OnlineOptions(**short | {"out": out} | given))
+        return resolve({name: value for name, value in (short | {"out": out} | given).items() if value is not None})
 
     return make

@@ -28,6 +28,8 @@ def test_a_run_ends_with_one_line_on_rounds_and_success(
     ("arguments", "message"),
     [
         (("--start", "nowhere"), "nowhere"),
+        (("--algo", "mc", "--steps", "5"), "No such option: --steps"),
+        (("--algo", "mc", "--anneal", "0.5"), "--anneal belongs to --algo corr-mc"),
         ((), "--algo: is needed from scratch; give it, or a run to go on from with --start"),
         (("--rounds", "0"), "--rounds: expected a number of at least 1, got 0"),
         (("--grasps", "none"), "'none' is not a valid integer"),
@@ -43,6 +45,14 @@ def test_nonsense_is_one_line_and_status_two_and_writes_nothing(
     assert code == 2 and message in err
     assert len([line for line in err.strip().splitlines() if "never" not in line]) == 1, err
     assert not (tmp_path / "never").exists()
+
+
+def test_the_help_shows_the_rounds_and_the_options_of_the_start_runs_estimator(
+    capsys: pytest.CaptureFixture[str], start: Path
+) -> None:
+    code, out, _ = called(capsys, "--start", start, "--help")
+    assert code == 0 and out.index("--exploration-start") < out.index("--batch-size") < out.index("--lag-steps")
+    assert "Options of --algo dql:" in out and "Options of --network paper:" in out and "--steps " not in out
 
 
 def test_data_of_another_task_are_refused(capsys: pytest.CaptureFixture[str], start: Path, tmp_path: Path) -> None:

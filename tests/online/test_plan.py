@@ -7,7 +7,7 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.online.plan import Plan, resolve
-from graspq.online.settings import OnlineOptions
+from graspq.train.settings import complete
 
 Make = Callable[..., Plan]
 
@@ -34,7 +34,16 @@ def test_options_given_stand_above_those_of_the_start_run(make_plan: Make, tmp_p
 
 def test_training_goes_on_at_the_constant_rate_of_its_run(make_plan: Make, tmp_path: Path) -> None:
     train = make_plan(tmp_path / "out").train
-    assert (train.schedule, train.warmup, train.learning_rate, train.anneal) == ("constant", 0.0, 1e-3, 0.0)
+    assert (train.schedule, train.warmup, train.learning_rate) == ("constant", 0.0, 1e-3)
+
+
+def test_the_correction_of_corr_mc_stays_risen(make_plan: Make, start: Path, tmp_path: Path, base: Path) -> None:
+    settings = complete({"algo": "corr-mc", "shards": (str(base),)}, "paper")
+    copy = shutil.copytree(start, tmp_path / "corr-mc")
+    config = json.loads((copy / "config.json").read_text()) | {"settings": settings.to_json()}
+    (copy / "config.json").write_text(json.dumps(config))
+    assert settings.own.anneal == 0.05
+    assert make_plan(tmp_path / "out", start=copy).train.own.anneal == 0.0
 
 
 def test_after_a_rate_that_fell_to_zero_it_goes_on_at_a_tenth(make_plan: Make, start: Path, tmp_path: Path) -> None:
@@ -47,11 +56,11 @@ def test_after_a_rate_that_fell_to_zero_it_goes_on_at_a_tenth(make_plan: Make, s
 
 
 def test_from_scratch_the_preset_decides_all_but_the_schedule(base: Path) -> None:
-    plan = resolve(OnlineOptions(algo="mc", shards=(str(base),), rounds=2, steps_per_round=10))
+    plan = resolve({"algo": "mc", "shards": (str(base),), "rounds": 2, "steps_per_round": 10})
     assert plan.start is None and plan.train.steps == 20 and plan.border(0) == 0
     assert (plan.train.schedule, plan.train.learning_rate, plan.train.batch_size) == ("constant", 2e-3, 256)
-    paper = resolve(OnlineOptions(algo="mc", shards=(str(base),), preset="paper"))
-    assert (paper.train.learning_rate, paper.train.batch_size, paper.train.loss) == (1e-3, 32, "squared")
+    paper = resolve({"algo": "mc", "shards": (str(base),), "preset": "paper"})
+    assert (paper.train.learning_rate, paper.train.batch_size, paper.train.own.loss) == (1e-3, 32, "squared")
     assert str(paper.train.run_folder) == "runs/online-mc-base-seed0"
 
 
@@ -65,6 +74,10 @@ def test_an_earlier_checkpoint_can_be_the_start(make_plan: Make, tmp_path: Path)
     ("given", "message"),
     [
         ({"algo": "mc"}, r"--algo: .* was trained with dql, got mc; leave the option out"),
+        ({"width": 16}, r"--width: .* was trained with 8, got 16"),
+        ({"loss": "cross-entropy"}, r"--loss: .* was trained with squared, got cross-entropy"),
+        ({"preset": "paper"}, r"--preset: .* has its settings already"),
+        ({"anneal": 0.5}, r"--anneal belongs to --algo corr-mc; it is no option of --algo dql"),
         ({"network": "default"}, r"--network: .* was trained with paper, got default"),
         ({"checkpoint": 5}, "has no checkpoint of step 5, only of 3, 6"),
         ({"start": Path("nowhere")}, "nowhere"),

@@ -91,7 +91,7 @@ def test_the_start_runs_weights_and_moments_are_taken_over_and_it_is_left_alone(
     make_plan: Make, start: Path, tmp_path: Path
 ) -> None:
     before = digests(start)
-    run = run_online(make_plan(tmp_path / "run", rounds=1, steps_per_round=1, keep_checkpoints=9))
+    run = run_online(make_plan(tmp_path / "run", rounds=1, steps_per_round=1))
     theirs, ours = digests(start / "checkpoints/step-00000006"), digests(run.checkpoint(6))
     assert ours == theirs
     assert digests(run.checkpoint(7)) != theirs

@@ -1,10 +1,7 @@
-import dataclasses
-
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.online.settings import OnlineOptions, OnlineSettings
-from graspq.train.settings import TrainSettings
+from graspq.online.settings import OnlineSettings
 
 
 def test_exploration_falls_linearly_from_one_to_a_twentieth_in_a_hundred_thousand_steps() -> None:
@@ -18,15 +15,8 @@ def test_all_three_numbers_of_the_schedule_are_settable() -> None:
     assert [settings.exploration(step) for step in (0, 5, 10)] == pytest.approx([0.8, 0.5, 0.2], abs=1e-12)
 
 
-def test_the_command_has_every_option_of_training_but_the_number_of_steps() -> None:
-    names = {field.name for field in dataclasses.fields(OnlineOptions)}
-    theirs = {field.name for field in dataclasses.fields(TrainSettings)}
-    assert theirs - names == {"steps"}
-    assert names - theirs == {field.name for field in dataclasses.fields(OnlineSettings)}
-
-
 def test_where_and_how_fast_grasps_are_made_does_not_decide_what_is_collected() -> None:
-    assert OnlineSettings(workers=3, checkpoint=7).deciding() == OnlineSettings().deciding()
+    assert OnlineSettings(engine="ray", workers=3, checkpoint=7).deciding() == OnlineSettings().deciding()
     assert OnlineSettings(cem_samples=32).deciding() != OnlineSettings().deciding()
 
 
