@@ -2,7 +2,8 @@
 
 from graspq.engine.local import warm_up
 from graspq.engine.running import run
+from graspq.engine.schedule import LostUnitsError
 from graspq.engine.settings import EngineSettings
 from graspq.engine.work import Place, Work
 
-__all__ = ["EngineSettings", "Place", "Work", "run", "warm_up"]
+__all__ = ["EngineSettings", "LostUnitsError", "Place", "Work", "run", "warm_up"]

@@ -14,6 +14,7 @@ import pickle
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -24,6 +25,8 @@ from typing import Any
 from graspq.engine import server
 from graspq.engine.work import Bench, Died, Failed, Outcome
 
+GRACE_SECONDS = 30.0
+ORPHAN_SECONDS = 3.0
 _bench: Bench | None = None
 
 
@@ -75,12 +78,22 @@ class LocalWorker:
         except BaseException as error:  # such as a unit that cannot be pickled
             return Failed(f"{type(error).__name__}: {error}")
 
-    def end(self, *, at_once: bool = False) -> None:
-        """End the process: when it is idle, or `at_once`."""
-        if at_once:
-            for process in self._processes:
-                process.kill()
+    def end(self) -> None:
+        """End an idle process, or wait for the end of one that was asked."""
         self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def ask_to_end(self) -> None:
+        """Send SIGTERM: a unit that handles it, such as a training, may keep what it has; all others end at once."""
+        for process in self._processes:
+            process.terminate()
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+    def kill(self, after: float) -> None:
+        """Kill the process if it is still there after some seconds."""
+        for process in self._processes:
+            process.join(after)
+            process.kill()
+        self.end()
 
 
 class LocalTeam:
@@ -125,11 +138,19 @@ class LocalTeam:
         worker.end()
 
     def close(self) -> None:
-        """Kill all that still work, and end the others."""
-        busy = set(self._busy.values())
-        for worker in self._workers:
-            worker.end(at_once=worker in busy)
+        """End all; what still works is asked first, and killed after a while or a second interruption."""
+        busy, workers = set(self._busy.values()), self._workers
         self._workers, self._busy = [], {}
+        until = time.monotonic() + GRACE_SECONDS
+        try:
+            for worker in busy:
+                worker.ask_to_end()
+            for worker in workers:
+                worker.kill(max(until - time.monotonic(), 0.0)) if worker in busy else worker.end()
+        except KeyboardInterrupt:
+            for worker in workers:
+                worker.kill(0.0)
+            raise
 
 
 @contextlib.contextmanager
@@ -163,10 +184,15 @@ def _begin(work: bytes, environment: dict[str, str]) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when the parent is gone, however: its executor would wait for units for ever."""
+    """End this process when the parent is gone, however: its executor would wait for units for ever.
+
+    A unit that handles SIGTERM has a moment to keep what it has.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(ORPHAN_SECONDS)
     os._exit(1)
 
 

@@ -10,6 +10,19 @@ from graspq.engine.work import Died, Done, Failed, Mistake, Outcome
 U = TypeVar("U")
 R = TypeVar("R")
 
+
+class LostUnitsError(UserError):
+    """Units that ended two workers each; all others are done.
+
+    Attributes:
+        lost: each unit, and how its last worker ended.
+    """
+
+    def __init__(self, message: str, lost: list[tuple[Any, str]]) -> None:
+        super().__init__(message)
+        self.lost = lost
+
+
 DEATHS_ALLOWED = 1
 NODE_DEATHS_ALLOWED = 10
 _STARTS_ALLOWED = 3  # failures in a row, before anything is done
@@ -68,7 +81,7 @@ class _Schedule:
         self._deaths: Counter[int] = Counter()
         self._node_deaths: Counter[int] = Counter()
         self._failed_starts = 0
-        self._lost: dict[int, str] = {}  # by the number of the unit
+        self._lost: dict[int, tuple[Any, str]] = {}  # by the number of the unit: unit, how its worker ended
 
     def run(self) -> Iterator[tuple[Any, Any]]:
         results: list[tuple[Any, Any]] = []
@@ -80,11 +93,13 @@ class _Schedule:
                 break
             results = [found for worker, news in self._team.wait() for found in self._heard(worker, news)]
         if self._lost:
-            raise UserError(f"{self._losses()}; all else is done")
+            raise self._losses("all else is done")
 
-    def _losses(self) -> str:
-        names = ", ".join(self._lost[number] for number in sorted(self._lost))
-        return f"{names} ended {'its' if len(self._lost) == 1 else 'their'} worker twice"
+    def _losses(self, otherwise: str) -> LostUnitsError:
+        lost = [self._lost[number] for number in sorted(self._lost)]
+        names = ", ".join(f"{self._name(unit)} ({how})" for unit, how in lost)
+        whose = "its" if len(lost) == 1 else "their"
+        return LostUnitsError(f"{names} ended {whose} worker twice; {otherwise}", lost)
 
     def _hand_out(self) -> None:
         while True:
@@ -158,8 +173,8 @@ class _Schedule:
         counts, allowed = (self._node_deaths, NODE_DEATHS_ALLOWED) if died.with_node else (self._deaths, DEATHS_ALLOWED)
         counts[number] += 1
         if counts[number] > allowed:
-            self._lost[number] = f"{self._name(unit)} ({died.how})"
+            self._lost[number] = unit, died.how
             if len(self._lost) > _STARTS_ALLOWED and not self._finished:
-                raise UserError(f"{self._losses()}; no unit could be done")
+                raise self._losses("no unit could be done")
         else:
             self._waiting.appendleft((number, unit))

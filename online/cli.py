@@ -1,6 +1,6 @@
 """`grasp-online`: the paper's on-policy setting.
 
-The way on: `plan` (what a command line means) -> `run` (the rounds) -> `growth` (their grasps) and `train.loop`.
+The way on: `resolve` (what a command line means) -> `rounds` -> `growth` (their grasps) and `train.loop`.
 """
 
 import importlib.util
@@ -33,6 +33,8 @@ class OnlineCommand(TrainingCommand):
         """Return the groups of options; the rounds say how many steps there are."""
         (name, first), *others = super().groups(ctx)
         rounds = ("Rounds", parameters(OnlineSettings))
+        for one in first:
+            one.required = False  # the start run says what is not given
         return [rounds, (name, [one for one in first if one.name != "steps"]), *others]
 
 
@@ -59,8 +61,8 @@ def main(context: click.Context, /, **_: Any) -> None:
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UserError("grasp-online runs in one process, WORLD_SIZE says several; start it without torchrun")
     # Imported late: --help must not wait for the simulator.
-    from graspq.online.plan import resolve
-    from graspq.online.run import run_online
+    from graspq.online.resolve import resolve
+    from graspq.online.rounds import run_online
 
     plan = resolve(given_options(context))
     click.echo(f"{plan.train.algo}: {plan.train.run_folder}", err=True)

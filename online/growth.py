@@ -26,7 +26,7 @@ from graspq.datasets.pool import ShardPool
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.engine import EngineSettings
 from graspq.objects.object_set import ObjectSet
-from graspq.online.plan import Plan
+from graspq.online.resolve import Plan
 from graspq.sim.play import Policy
 from graspq.sim.task import Task
 

@@ -1,4 +1,4 @@
-"""Settings of the rounds of `grasp-online`; those of training stand beside them (`plan`)."""
+"""Settings of the rounds of `grasp-online`; those of training stand beside them (`resolve`)."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A sweep as data: jobs, each one point of the grid and one seed, and what all of them share.
+"""A sweep as data: a list of jobs, each named by what it is and done when its output is there, and what they share.
 
 `plan.json` in the sweep's folder is this plan; whether a job is done stands in the job's own files alone (`state`).
 """
@@ -13,9 +13,10 @@ from graspq.common.errors import UserError
 from graspq.common.files import read_json, write_json
 
 PLAN_FILE = "plan.json"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 # Source: Quillen et al. 2018, section "Experimental Results": on-policy runs add 50 grasps each 1,000 training steps.
 STEPS_PER_ROUND, GRASPS_PER_ROUND = 1_000, 50
+_SHORT = {"learning_rate": "lr", "exploration_steps": "exploration"}
 
 
 @dataclass(frozen=True)
@@ -24,18 +25,12 @@ class Job:
 
     Attributes:
         algo: the estimator.
-        learning_rate: learning rate.
-        width: channels and units of the paper's network.
-        discount: γ; None where the estimator uses none.
-        exploration_steps: training steps over which exploration falls; None without fresh grasps.
+        options: what varies besides: name of an option of training, its value as a command line gives it.
         seed: seed of the training.
     """
 
     algo: str
-    learning_rate: float
-    width: int
-    discount: float | None
-    exploration_steps: int | None
+    options: tuple[tuple[str, str], ...]
     seed: int
 
     @property
@@ -44,14 +39,17 @@ class Job:
 
         It depends on the job alone, so that a grid that grows keeps the names it has.
         """
-        parts = [re.sub(r"[^A-Za-z0-9._-]+", ".", self.algo), f"lr{self.learning_rate:.12g}", f"width{self.width}"]
-        parts += [f"discount{self.discount:.12g}"] if self.discount is not None else []
-        parts += [f"exploration{self.exploration_steps}"] if self.exploration_steps is not None else []
-        return "-".join([*parts, f"seed{self.seed}"])
+        parts = [self.algo, *(f"{_SHORT.get(name, name)}{value}" for name, value in self.options), f"seed{self.seed}"]
+        return "-".join(re.sub(r"[^A-Za-z0-9._+-]+", ".", part) for part in parts)
 
     def to_json(self) -> dict[str, Any]:
         """Return what varies as plain JSON values, the name first."""
-        return {"id": self.id, **dataclasses.asdict(self)}
+        return {"id": self.id, "algo": self.algo, "options": dict(self.options), "seed": self.seed}
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Job":
+        """Return the job that `to_json` wrote."""
+        return cls(values["algo"], tuple(values["options"].items()), values["seed"])
 
 
 @dataclass(frozen=True)
@@ -80,6 +78,11 @@ class Plan:
     notes: tuple[str, ...]
     jobs: tuple[Job, ...]
 
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Names of the options that vary, in the order in which jobs name them."""
+        return tuple(dict.fromkeys(name for job in self.jobs for name, _ in job.options))
+
     def to_json(self) -> dict[str, Any]:
         """Return the content of `plan.json`."""
         shared = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
@@ -88,8 +91,7 @@ class Plan:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Plan":
         """Return the plan that `to_json` wrote."""
-        names = [field.name for field in dataclasses.fields(Job)]
-        jobs = tuple(Job(**{name: job[name] for name in names}) for job in values["jobs"])
+        jobs = tuple(Job.from_json(job) for job in values["jobs"])
         shared = {field.name: values[field.name] for field in dataclasses.fields(cls)}
         tuples = {"shards": tuple(values["shards"]), "notes": tuple(values["notes"]), "jobs": jobs}
         return cls(**shared | tuples)
@@ -109,7 +111,7 @@ def read_plan(folder: Path) -> Plan | None:
         raise UserError(f"{path}: expected the plan of a sweep, format {FORMAT_VERSION}; choose another --out")
     try:
         return Plan.from_json(values)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path}: not a whole plan of a sweep ({error}); choose another --out") from None
 
 

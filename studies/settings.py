@@ -6,16 +6,39 @@ Lists such as `--learning-rate 0.01 0.001` replace a preset's own; the rest of i
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from graspq.common.errors import UserError
-from graspq.common.options import Settings, flag, parse_count, setting
+from graspq.common.options import flag, parse_count, setting
+from graspq.engine import EngineSettings
 
 PresetName = Literal["small", "paper"]
+# What the sweep itself says of each of its trainings.
+SET_BY_SWEEP = frozenset({"algo", "shards", "out", "seed", "steps", "threads", "device", "objects", "start"})
+
+
+class Varied(NamedTuple):
+    """An option of training by its name, and the values that it takes, as a command line would give them."""
+
+    name: str
+    values: tuple[str, ...]
+
+
+def parse_varied(text: str) -> Varied:
+    """Return what `NAME=V1,V2` says; dashes and underscores are the same.
+
+    Raises:
+        ValueError: it says something else.
+    """
+    name, _, values = text.partition("=")
+    found = tuple(dict.fromkeys(value.strip() for value in values.split(",")))
+    if not name or not all(found):
+        raise ValueError("expected an option of training and its values, such as anneal=0.1,1 or mirror=true,false")
+    return Varied(name.strip().lstrip("-").replace("-", "_"), found)
 
 
 @dataclass(frozen=True)
-class SweepSettings(Settings):
+class SweepSettings(EngineSettings):
     """Settings of `grasp-sweep`; see each field's help."""
 
     preset: PresetName = setting(
@@ -34,6 +57,13 @@ class SweepSettings(Settings):
     exploration_steps: tuple[int, ...] = setting(
         (), help="Training steps over which exploration falls (paper). Default: 10000, which the paper prints twice."
     )
+    vary: tuple[Varied, ...] = setting(
+        (),
+        help="Any other option of training and its values, such as anneal=0.1,1 or mirror=true,false; of the "
+        "estimators that have it. May be repeated.",
+        parse=parse_varied,
+        metavar="NAME=V1,V2",
+    )
     seeds: int | None = setting(None, help="Training seeds, from 0 on. Default: 1 (small), 9 (paper).", minimum=1)
     steps: int | None = setting(
         None, help="Training steps of each run, such as 5k. Default: 5k (small), 2M (paper).", parse=parse_count
@@ -42,8 +72,13 @@ class SweepSettings(Settings):
         None, help="Grasps that each run is scored on. Default: 200 (small), 1000 (paper).", parse=parse_count
     )
     device: Literal["auto", "cpu", "cuda"] = setting("auto", help="Where networks run.")
-    jobs: int = setting(1, help="How many jobs run at a time; they share the cores.", minimum=1)
-    threads: int | None = setting(None, help="CPU threads of each job. Default: cores / jobs.", minimum=1)
+    workers: int | None = setting(
+        None,
+        help="How many jobs run at a time. Default: 1, on Ray as many as the cluster has cores for; 0 runs them in "
+        "this process.",
+        minimum=0,
+    )
+    threads: int | None = setting(None, help="CPU threads of each job. Default: cores / workers, 1 on Ray.", minimum=1)
     out: Path | None = setting(None, help="Folder of the sweep; runs/sweep-PRESET where it is not given.")
     retry_failed: bool = setting(False, help="Run jobs again that failed.")
     dry_run: bool = setting(False, help="Print the plan and stop; nothing is written.")
@@ -59,6 +94,14 @@ class SweepSettings(Settings):
         self._check("width", lambda value: value >= 1, "numbers of at least 1")
         self._check("discount", lambda value: 0 <= value <= 1, "numbers of 0 to 1")
         self._check("exploration_steps", lambda value: value >= 1, "numbers of at least 1")
+        names = [varied.name for varied in self.vary]
+        for name in names:
+            if name in SET_BY_SWEEP:
+                raise UserError(f"--vary {name}: the sweep sets {flag(name)} of each training; use its own options")
+            if names.count(name) > 1:
+                raise UserError(f"--vary {name}: named twice; give all its values once, as {name}=V1,V2")
+            if getattr(self, name, ()) and name in ("learning_rate", "width", "discount", "exploration_steps"):
+                raise UserError(f"--vary {name}: {flag(name)} names values too; use one of them")
 
     def _check(self, name: str, good: Callable[[float], bool], expected: str) -> None:
         for value in getattr(self, name):

@@ -54,7 +54,7 @@ def failure_file(folder: Path, job: Job) -> Path:
     return folder / "failures" / f"{job.id}.json"
 
 
-def note_failure(folder: Path, job: Job, command: str, exit_status: int, reason: str) -> None:
+def note_failure(folder: Path, job: Job, *, command: str, exit_status: int, reason: str) -> None:
     """Note durably that a job failed; it is then not run again unless asked."""
     note = {"id": job.id, "command": command, "exit_status": exit_status, "reason": reason}
     write_json(failure_file(folder, job), note)

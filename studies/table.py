@@ -9,18 +9,19 @@ from typing import Any
 
 from graspq.common.text import markdown
 from graspq.evaluate.sweep_table import write_sweep_table
+from graspq.studies.plan import Plan
 from graspq.studies.state import State
 
-VARIED = ("algo", "learning_rate", "width", "discount", "exploration_steps", "seed")
-COLUMNS = (
-    "id", *VARIED, "status", "steps", "success_rate", "ci95_low", "ci95_high", "successes", "episodes",
-    "training_seconds", "reason",
+OUTCOME = (
+    "status", "steps", "success_rate", "ci95_low", "ci95_high", "successes", "episodes", "training_seconds", "reason",
 )  # fmt: skip
 
 
-def row_of(state: State) -> dict[str, Any]:
+def row_of(plan: Plan, state: State) -> dict[str, Any]:
     """Return a job's row; what is not known yet, or not used, is None."""
-    row: dict[str, Any] = dict.fromkeys(COLUMNS) | state.job.to_json()
+    job = state.job
+    row: dict[str, Any] = {"id": job.id, "algo": job.algo, **dict.fromkeys(plan.varied), "seed": job.seed}
+    row |= {name: _value(text) for name, text in job.options} | dict.fromkeys(OUTCOME)
     row |= {"status": state.status, "steps": state.steps, "reason": state.reason}
     row["training_seconds"] = state.training_seconds
     if state.evaluation is not None:
@@ -30,19 +31,30 @@ def row_of(state: State) -> dict[str, Any]:
     return row
 
 
-def write_tables(folder: Path, states: Sequence[State]) -> None:
+def _value(text: str) -> int | float | str:
+    """Return an option's value as a number, where it is one."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def write_tables(folder: Path, plan: Plan, states: Sequence[State]) -> None:
     """Write `sweep.jsonl` and `sweep.csv`, each atomically."""
-    write_sweep_table(folder, COLUMNS, [row_of(state) for state in states])
+    write_sweep_table(folder, ("id", "algo", *plan.varied, "seed", *OUTCOME), [row_of(plan, one) for one in states])
 
 
-def as_markdown(states: Sequence[State]) -> str:
+def as_markdown(plan: Plan, states: Sequence[State]) -> str:
     """Return the table in Markdown: estimators in the plan's order, within each by success, what failed last.
 
     A column in which no job has a value is left out.
     """
     order = {algo: index for index, algo in enumerate(dict.fromkeys(state.job.algo for state in states))}
-    rows = sorted((row_of(state) for state in states), key=lambda row: (order[row["algo"]], *_rank(row)))
-    varied = [name for name in VARIED if any(row[name] is not None for row in rows)]
+    rows = sorted((row_of(plan, state) for state in states), key=lambda row: (order[row["algo"]], *_rank(row)))
+    names = ("algo", *plan.varied, "seed")
+    varied = [name for name in names if any(row[name] is not None for row in rows)]
     heads = [name.replace("_", " ") for name in varied] + ["success", "95 % interval", "steps", "training", "status"]
     return markdown(heads, [[*(_text(row[name]) for name in varied), *_outcome(row)] for row in rows])
 

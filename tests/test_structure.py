@@ -26,7 +26,19 @@ MAY_IMPORT = {
     "evaluate": {"engine", "policies", "sim", "objects", "train", "datasets", "common"},
     "report": {"evaluate", "train", "datasets", "objects", "common"},
     "online": {"engine", "policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
-    "studies": {"policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "online", "report", "common"},
+    "studies": {
+        "engine",
+        "policies",
+        "sim",
+        "objects",
+        "datagen",
+        "datasets",
+        "train",
+        "evaluate",
+        "online",
+        "report",
+        "common",
+    },
 }
 MAY_IMPORT["benchmarks"] = set(MAY_IMPORT)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from graspq.objects.object_set import ObjectSet
-from graspq.online.plan import Plan, resolve
+from graspq.online.resolve import Plan, resolve
 from graspq.train.loop import train
 from graspq.train.settings import complete
 

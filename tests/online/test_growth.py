@@ -8,7 +8,8 @@ from graspq.datagen.settings import CollectionSettings
 from graspq.datasets.dataset import open_shards
 from graspq.objects.object_set import ObjectSet
 from graspq.online.growth import GrowingDataset, collection_settings, round_blocks
-from graspq.online.policy import LatestPolicy
+from graspq.policies.exploring import ExploringPolicy
+from graspq.policies.of_run import load
 from graspq.policies.random import RandomPolicy
 from graspq.sim.task import TASKS
 
@@ -28,7 +29,7 @@ def test_a_round_is_collected_once_and_is_the_same_from_worker_processes(
     make_plan, tmp_path: Path, base: Path, regular_objects: ObjectSet, start: Path
 ) -> None:
     pool, files = open_shards([base]), []
-    policy = LatestPolicy(start, 6, 0.3, RandomPolicy(), make_plan(tmp_path / "out").online.cem)
+    policy = ExploringPolicy(0.3, RandomPolicy(), load(start, 6, device="cpu"))
     for workers in (0, 1):
         plan = make_plan(tmp_path / "out", grasps=3, workers=workers)
         growing = GrowingDataset.open(tmp_path / str(workers), plan, TASKS["regular"], regular_objects, pool)

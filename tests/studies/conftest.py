@@ -17,10 +17,11 @@ from graspq.train.selection import CemSettings
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+DISCOUNTED = (("width", "32"), ("discount", "0.9"))
 JOBS = (
-    Job("dql", 0.01, 32, 0.9, None, 0),
-    Job("dql", 0.001, 32, 0.9, None, 0),
-    Job("mc", 0.001, 64, None, None, 0),
+    Job("dql", (("learning_rate", "0.01"), *DISCOUNTED), 0),
+    Job("dql", (("learning_rate", "0.001"), *DISCOUNTED), 0),
+    Job("mc", (("learning_rate", "0.001"), ("width", "64")), 0),
 )
 
 
@@ -31,7 +32,9 @@ def plan() -> Plan:
 
 def trained(folder: Path, job: Job, step: int, rows: tuple[dict[str, Any], ...] = ()) -> Run:
     """A run folder with its configuration, metrics and the newest checkpoint's folder."""
-    run = Run.create_or_resume(run_folder(folder, job), {"settings": {"batch_size": 32}, "network": 0, "dataset": {}})
+    run = Run.create_or_resume(
+        run_folder(folder, job), {"settings": {"batch_size": 32}, "network": 0, "dataset": {}}, frozenset()
+    )
     for row in rows:
         run.append_metrics(row)
     (run.checkpoints_folder / checkpoint_name(step)).mkdir(parents=True)

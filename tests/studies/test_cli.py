@@ -33,6 +33,8 @@ def test_a_dry_run_prints_every_job_and_the_count_and_writes_nothing(
         (("--preset", "paper", "--algo", "mc", "dql"), "data/regular-100k"),
         (("--algo", "sarsa"), "'sarsa' is unknown"),
         (("--learning-rate", "0"), "--learning-rate: expected numbers above 0"),
+        (("--vary", "anneal"), "expected an option of training and its values"),
+        (("--algo", "mc", "--vary", "anneal=1"), "--vary anneal: no option of training with mc"),
         (("--steps", "few"), "expected a whole number"),
     ],
 )

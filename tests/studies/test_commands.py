@@ -8,8 +8,8 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.studies.commands import Means, check_commands, check_data, next_command, training_command
+from graspq.studies.grid import make_plan
 from graspq.studies.plan import Job, Plan
-from graspq.studies.presets import make_plan
 from graspq.studies.settings import SweepSettings
 from graspq.studies.state import state_of
 from graspq.train.estimators import ESTIMATORS
@@ -22,21 +22,34 @@ def test_the_commands_understand_every_job_of_every_estimator(preset: Any, tmp_p
     check_commands(tmp_path, plan, list(plan.jobs), Means(1, "cpu"))
 
 
-def test_an_estimator_that_is_not_there_yet_is_refused_in_one_line_when_it_would_run(
-    plan: Plan, tmp_path: Path
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((("learning_rate", "fast"),), "'fast' is not a valid float"),
+        ((("batch_size", "1"),), "--batch-size: expected a number of at least 2, got 1"),
+        ((("mirror", "yes"),), "--vary mirror: is a switch, expected true or false, got 'yes'"),
+    ],
+)
+def test_a_value_that_training_refuses_is_one_line_before_anything_runs(
+    plan: Plan, tmp_path: Path, options: tuple[tuple[str, str], ...], said: str
 ) -> None:
-    missing = dataclasses.replace(plan, jobs=(Job("sarsa", 0.01, 32, None, None, 0),))
-    with pytest.raises(
-        UserError, match=r"sarsa-lr0\.01.*grasp-train cannot run it.*'sarsa' is unknown.*nothing was run"
-    ):
-        check_commands(tmp_path, missing, list(missing.jobs), Means(1))
+    wrong = (Job("mc", options, 0),)
+    with pytest.raises(UserError, match=said):
+        check_commands(tmp_path, dataclasses.replace(plan, jobs=wrong), wrong, Means(1, "cpu"))
+
+
+def test_switches_are_turned_on_and_off(plan: Plan, tmp_path: Path) -> None:
+    job = Job("corr-mc", (("mirror", "true"), ("centred", "false"), ("preset", "default")), 0)
+    words = str(training_command(tmp_path, plan, job, Means(1)))
+    assert "--preset default --mirror --no-centred" in words and "--preset paper" not in words
 
 
 def test_on_policy_jobs_train_in_the_papers_rounds(tmp_path: Path) -> None:
     plan = make_plan(SweepSettings(preset="paper", algo=("mc",), steps=7000))
     words = str(training_command(tmp_path, plan, plan.jobs[0], Means(3)))
     assert words.startswith("grasp-online --algo mc --shards data/regular-100k --preset paper --learning-rate 0.01")
-    assert "--rounds 7 --steps-per-round 1000 --grasps 50 --exploration-steps 10000 --workers 3" in words
+    assert "--exploration-steps 10000 " in words
+    assert "--rounds 7 --steps-per-round 1000 --grasps 50 --workers 3" in words
     assert "--discount" not in words
 
 

@@ -10,16 +10,18 @@ from graspq.studies.plan import Job, Plan, joined, read_plan, write_plan
 
 
 def test_a_jobs_name_says_what_varies_and_leaves_out_what_it_does_not_use() -> None:
-    assert Job("dql", 0.001, 32, 0.9, None, 0).id == "dql-lr0.001-width32-discount0.9-seed0"
-    assert Job("mc", 1e-05, 64, None, 10_000, 8).id == "mc-lr1e-05-width64-exploration10000-seed8"
-    assert Job("my_module:row", 0.01, 32, 0.95, None, 1).id == "my_module.row-lr0.01-width32-discount0.95-seed1"
+    rate = ("learning_rate", "0.001")
+    assert Job("dql", (rate, ("width", "32"), ("discount", "0.9")), 0).id == "dql-lr0.001-width32-discount0.9-seed0"
+    assert Job("mc", (("exploration_steps", "10000"),), 8).id == "mc-exploration10000-seed8"
+    assert Job("my_module:row", (rate, ("mirror", "true")), 1).id == "my_module.row-lr0.001-mirrortrue-seed1"
 
 
 def test_jobs_that_differ_have_names_that_differ() -> None:
-    job = Job("dql", 0.001, 32, 0.9, 10, 0)
-    changes = {"algo": "mc", "learning_rate": 0.0010001, "width": 33, "discount": 0.9001, "exploration_steps": 11}
-    others = [dataclasses.replace(job, **{name: value}) for name, value in (changes | {"seed": 1}).items()]
-    assert len({one.id for one in [job, *others]}) == 7
+    job = Job("dql", (("learning_rate", "0.001"), ("width", "32")), 0)
+    others = [dataclasses.replace(job, algo="mc"), dataclasses.replace(job, seed=1)]
+    others += [dataclasses.replace(job, options=(("learning_rate", "0.0010001"), ("width", "32")))]
+    others += [dataclasses.replace(job, options=(("learning_rate", "0.001"), ("width", "33")))]
+    assert len({one.id for one in [job, *others]}) == 5
 
 
 def test_a_plan_is_read_as_it_was_written(plan: Plan, tmp_path: Path) -> None:
@@ -28,7 +30,7 @@ def test_a_plan_is_read_as_it_was_written(plan: Plan, tmp_path: Path) -> None:
     assert read_plan(tmp_path) == plan
 
 
-@pytest.mark.parametrize("text", ["{}", "[", '{"format_version": 1, "jobs": [{}]}'])
+@pytest.mark.parametrize("text", ["{}", "[", '{"format_version": 2, "jobs": [{}]}'])
 def test_a_file_that_is_no_plan_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "plan.json").write_text(text)
     with pytest.raises(UserError, match=r"plan\.json"):

@@ -44,7 +44,7 @@ def test_an_evaluation_with_damaged_rows_does_not_count(plan: Plan, tmp_path: Pa
 
 def test_a_failure_keeps_its_reason_until_the_job_is_done_all_the_same(plan: Plan, tmp_path: Path, write: Any) -> None:
     job = plan.jobs[0]
-    note_failure(tmp_path, job, "grasp-train", 2, "dql diverged at step 7")
+    note_failure(tmp_path, job, command="grasp-train", exit_status=2, reason="dql diverged at step 7")
     state = state_of(tmp_path, plan, job)
     assert (state.status, state.reason) == ("failed", "dql diverged at step 7")
     write.trained(tmp_path, job, 100)

@@ -10,23 +10,23 @@ import pytest
 from graspq.evaluate.statistics import wilson_interval
 from graspq.studies.plan import Plan
 from graspq.studies.state import note_failure, state_of
-from graspq.studies.table import COLUMNS, as_markdown, line_of, write_tables
+from graspq.studies.table import OUTCOME, as_markdown, line_of, write_tables
 
 
 @pytest.fixture
 def states(plan: Plan, tmp_path: Path, write: Any) -> Any:
     first, second, third = plan.jobs
-    note_failure(tmp_path, first, "grasp-train", 2, "diverged | at step 7")
+    note_failure(tmp_path, first, command="grasp-train", exit_status=2, reason="diverged | at step 7")
     write.trained(tmp_path, second, 100, ({"step": 100, "loss": 1.0, "samples_per_second": 3200.0},))
     write.scored(tmp_path, second, 3)
     write.trained(tmp_path, third, 40)
     return [state_of(tmp_path, plan, job) for job in plan.jobs]
 
 
-def test_json_lines_and_csv_hold_the_same_rows(states: Any, tmp_path: Path) -> None:
-    write_tables(tmp_path, states)
+def test_json_lines_and_csv_hold_the_same_rows(states: Any, plan: Plan, tmp_path: Path) -> None:
+    write_tables(tmp_path, plan, states)
     failed, done, todo = (json.loads(line) for line in (tmp_path / "sweep.jsonl").read_text().splitlines())
-    assert tuple(done) == COLUMNS
+    assert tuple(done) == ("id", "algo", "learning_rate", "width", "discount", "seed", *OUTCOME)
     assert (done["status"], done["steps"], done["success_rate"], done["training_seconds"]) == ("done", 100, 0.3, 1.0)
     assert (done["ci95_low"], done["ci95_high"]) == wilson_interval(3, 10)
     assert (done["algo"], done["learning_rate"], done["discount"], done["seed"]) == ("dql", 0.001, 0.9, 0)
@@ -38,8 +38,8 @@ def test_json_lines_and_csv_hold_the_same_rows(states: Any, tmp_path: Path) -> N
         assert row == {name: "" if value is None else str(value) for name, value in other.items()}
 
 
-def test_the_markdown_table_leaves_out_what_no_job_uses_and_puts_failures_last(states: Any) -> None:
-    head, _, first, second, third = as_markdown(states).splitlines()
+def test_the_markdown_table_leaves_out_what_no_job_uses_and_puts_failures_last(states: Any, plan: Plan) -> None:
+    head, _, first, second, third = as_markdown(plan, states).splitlines()
     assert head == (
         "| algo | learning rate | width | discount | seed | success | 95 % interval | steps | training | status |"
     )

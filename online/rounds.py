@@ -17,8 +17,8 @@ from graspq.datasets.pool import ShardPool
 from graspq.evaluate.scenes import find_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.online.growth import GrowingDataset
-from graspq.online.plan import Plan
 from graspq.online.pools import PoolOfRounds
+from graspq.online.resolve import Plan
 from graspq.policies.exploring import ExploringPolicy
 from graspq.policies.of_run import load
 from graspq.policies.random import RandomPolicy

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.online.plan import Plan, resolve
+from graspq.online.resolve import Plan, resolve
 from graspq.train.settings import complete
 
 Make = Callable[..., Plan]

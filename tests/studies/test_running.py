@@ -6,14 +6,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from graspq.common.errors import UserError
-from graspq.studies import run
+from graspq.common.files import locked
 from graspq.studies.cli import main
-from graspq.studies.run import locked
 from graspq.train.run import Run
 
 ID, DIVERGING = "mc-lr0.001-width4-seed0", "mc-lr1e+30-width4-seed0"
@@ -31,13 +28,13 @@ def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_s
     dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--algo", "mc", "--learning-rate", "0.001", "1e30", "--width", "4", "--shards", str(dataset)]
-    words += ["--steps", "30", "--episodes", "2", "--jobs", "2", "--threads", "1", "--device", "cpu"]
+    words += ["--steps", "30", "--episodes", "2", "--workers", "2", "--threads", "1", "--device", "cpu"]
     words += ["--out", str(tmp_path)]
     sweep = [str(Path(sys.executable).with_name("grasp-sweep")), *words]
 
     process = subprocess.Popen(sweep)
     wait_for(tmp_path / "logs" / f"{ID}.log", process)
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
     assert process.wait(timeout=120) == 130
     assert not (tmp_path / "failures").exists()
 
@@ -46,7 +43,8 @@ def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_s
     process.kill()
     process.wait()
     capfd.readouterr()
-    with locked(tmp_path):  # free: no command of the killed sweep lives on
+    time.sleep(5)
+    with locked(tmp_path, "test"), locked(tmp_path / "runs" / ID, "test"):  # free: nothing of the killed sweep lives on
         pass
 
     with pytest.raises(SystemExit) as ended:
@@ -70,11 +68,3 @@ def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_s
     assert ended.value.code == 1
     assert "2 of 2 jobs finished before" in capfd.readouterr().err
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*") if path.is_file()}
-
-
-def test_a_folder_belongs_to_one_sweep_at_a_time(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
-    with locked(tmp_path), pytest.raises(UserError, match="another grasp-sweep works here"), locked(tmp_path):
-        pass
-    with locked(tmp_path):
-        pass

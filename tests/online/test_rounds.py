@@ -18,8 +18,8 @@ from graspq.datasets.dataset import Dataset, open_shards
 from graspq.datasets.verify import verify
 from graspq.objects.object_set import ObjectSet
 from graspq.online import growth
-from graspq.online.plan import Plan
-from graspq.online.run import run_online
+from graspq.online.resolve import Plan
+from graspq.online.rounds import run_online
 from graspq.policies.of_run import load
 from graspq.train import loop
 from graspq.train.estimators import ESTIMATORS
