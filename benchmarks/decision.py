@@ -48,6 +48,7 @@ class DecisionSettings(BenchmarkSettings):
     turns: int = setting(7, help="Turns that are measured, after one that is not.", minimum=1)
     network: str = setting("default", help="Network: default or paper.")
     batch: tuple[int, ...] = setting((1, 32), help="States that are decided for at once.")
+    many: tuple[int, ...] = setting((1, 256), help="States for which Q of candidates is asked at once.")
     threads: int | None = setting(None, help="CPU threads; torch's own choice if not given.", minimum=1)
 
 
@@ -168,10 +169,10 @@ def measure(settings: DecisionSettings) -> Result:
     network = cast(QNetwork, build(q_network, specification, seeded("benchmarks/decision/weights"))).eval()
     actor = build(state_network(ACTION.size), specification, seeded("benchmarks/decision/weights")).eval()
     spread_out(network)
-    deviation = min(check_deviation(network, batch) for batch in settings.batch)
+    deviation = min(check_deviation(network, batch) for batch in {*settings.batch, *settings.many})
     difference = max(check_rivals(network, batch) for batch in settings.batch)
     rows = [row for batch in settings.batch for row in decision_rows(network, actor, batch, settings.turns)]
-    costs = [row for batch in settings.batch for row in candidate_rows(network, batch, settings.turns)]
+    costs = [row for batch in settings.many for row in candidate_rows(network, batch, settings.turns)]
     tiled = next(row["times of trunk once"] for row in rows if row["decision"] == TILED)
     return Result(
         [Ratio("a CEM decision, against 64 tiled copies in each iteration", tiled, bar=4)],

@@ -1,1 +1,1 @@
-"""One self-contained HTML page on runs, evaluations and sweeps. Nothing here imports PyBullet."""
+"""One self-contained HTML page on runs, evaluations and sweeps. It needs no PyBullet, and PyTorch for little."""

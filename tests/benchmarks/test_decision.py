@@ -91,7 +91,9 @@ def test_a_candidate_whose_q_depends_on_the_others_is_refused(monkeypatch, netwo
 
 
 def test_the_published_ratio_is_that_of_one_state():
-    result = decision.measure(decision.DecisionSettings(network="paper", turns=1, batch=(1, BATCH), threads=1))
+    result = decision.measure(
+        decision.DecisionSettings(network="paper", turns=1, batch=(1, BATCH), many=(1, 8), threads=1)
+    )
     rows = result.tables["Decisions of a policy"]
     assert [(row["batch"], row["decision"]) for row in rows] == [
         (batch, name) for batch in (1, BATCH) for name in (*WAYS, decision.ACTOR)
@@ -99,5 +101,5 @@ def test_the_published_ratio_is_that_of_one_state():
     assert result.ratios[0].value == rows[0]["times of trunk once"] and rows[0]["decision"] == TILED
     costs = result.tables["Q of N candidates for a state, trunk once"]
     assert [(row["batch"], row["candidates"]) for row in costs] == [
-        (batch, str(count)) for batch in (1, BATCH) for count in decision.CANDIDATES
+        (batch, str(count)) for batch in (1, 8) for count in decision.CANDIDATES
     ]

@@ -212,10 +212,12 @@ def test_the_command_writes_the_page_and_refuses_what_holds_nothing(
     assert not (tmp_path / "none.html").exists()
 
 
-def test_a_report_is_made_without_the_simulator(scored: Path) -> None:
+def test_a_report_needs_no_simulator_and_one_on_evaluations_no_pytorch_either(scored: Path) -> None:
     script = (
         "import sys; sys.modules['pybullet'] = None\n"
         "from pathlib import Path; from graspq.report.page import write_report\n"
+        f"write_report([Path({str(scored / 'baselines')!r})], Path({str(scored / 'out.html')!r}))\n"
+        "assert 'torch' not in sys.modules\n"
         f"write_report([Path({str(scored / 'runs')!r})], Path({str(scored / 'out.html')!r}))\n"
         "print([name for name in sys.modules if name.startswith('graspq.sim')])\n"
     )
