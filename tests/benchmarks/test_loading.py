@@ -46,10 +46,13 @@ def test_a_small_pool_is_named_so_often_that_a_tenth_of_it_is_enough(pool):
     assert len(wide.blocks) // 10 >= 2 * 64
 
 
-def test_all_ways_are_measured_against_png_files(shards):
+def test_ours_is_measured_against_png_files_and_a_rival_that_is_left_out_is_not_measured(shards, monkeypatch):
+    for name in set(RIVALS) - {PNG}:
+        monkeypatch.delitem(RIVALS, name)
     settings = LoadingSettings(shards=(shards,), batch_size=BATCH, workers=0, turns=1, rival_batches=2)
     result = measure(settings)
     rows = {row["loader"]: row for row in result.tables["Loading shuffled transitions with s' from disk"]}
-    assert set(rows) >= {STREAMING, PNG} and rows[PNG][f"times {PNG}"] == 1.0
+    assert len(rows) == 4 and rows[PNG][f"times {PNG}"] == 1.0
     assert all(row["samples a second"] > 0 for row in rows.values())
     assert result.ratios[0].value == rows[STREAMING][f"times {PNG}"]
+    assert {ratio.row()[1] for ratio in result.ratios[3:]} == {"not measured"}

@@ -79,8 +79,10 @@ def test_a_plain_step_changes_weights_and_average_and_of_dql_at_last_the_lagged_
         assert torch.equal(rival.lagged.state_dict()[weight], rival.network.state_dict()[weight])
 
 
-def test_the_pieces_of_a_step_make_most_of_it(ours):
+def test_every_piece_of_a_step_is_timed_and_the_networks_share_is_of_a_whole_step(ours):
     row = training.pieces_row(ours[0], [ours[1]] * 4)
-    pieces = [value for name, value in row.items() if name.endswith("(ms)") and name != "step (ms)"]
-    assert len(pieces) == 6
-    assert 0.5 * row["step (ms)"] < sum(pieces) < 2 * row["step (ms)"]
+    pieces = {name.removesuffix(" (ms)"): value for name, value in row.items() if name.endswith("(ms)")}
+    assert set(pieces) == {"step", "augmentation", "target", "forward", "backward", "optimiser", "averages"}
+    assert min(pieces.values()) > 0 and pieces["step"] > pieces["optimiser"]
+    share = (pieces["forward"] + pieces["backward"]) / pieces["step"]
+    assert row["share of forward and backward"] == f"{share:.0%}"
