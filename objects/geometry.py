@@ -3,9 +3,9 @@
 Dimension key: V vertices, H half-spaces (one a face plane).
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import manifold3d
 import numpy as np
@@ -51,27 +51,12 @@ def half_spaces(part: trimesh.Trimesh) -> Array:
     return equations
 
 
-@dataclasses.dataclass(frozen=True)
-class MassProperties:
-    """Integrals over a solid of density 1, all about the origin.
-
-    `volume` m³, `first` [3] m⁴ (volume times centre), `inertia` [3, 3] m⁵.
-    """
+class MassProperties(NamedTuple):
+    """Of a solid of density 1: `volume` m³, `centre` [3] of mass in metres, `inertia` [3, 3] about that centre, m⁵."""
 
     volume: float
-    first: Array
+    centre: Array
     inertia: Array
-
-    @property
-    def centre(self) -> Array:
-        """Centre of mass [3], metres."""
-        return self.first / self.volume
-
-    def inertia_about_centre(self) -> Array:
-        """Inertia tensor [3, 3] about the centre of mass (Steiner's theorem), m⁵."""
-        c = self.centre
-        shifted: Array = self.inertia - self.volume * (c @ c * np.eye(3) - np.outer(c, c))
-        return shifted
 
 
 def union_mass_properties(parts: Sequence[trimesh.Trimesh]) -> MassProperties:
@@ -84,7 +69,7 @@ def union_mass_properties(parts: Sequence[trimesh.Trimesh]) -> MassProperties:
         parts: convex, watertight, faces outward; metres.
 
     Returns:
-        Mass properties for density 1, about the origin. Overlaps count once.
+        Mass properties for density 1. Overlaps count once.
 
     Raises:
         UserError: so many parts lie inside each other that the sum would have more than 4,096 terms.
@@ -107,7 +92,14 @@ def union_mass_properties(parts: Sequence[trimesh.Trimesh]) -> MassProperties:
             if (both := common ^ solids[other]).volume() > _THIN * size * both.surface_area()
         ]
         sign = -sign
-    return MassProperties(float(total[0]), total[1:4], total[4:].reshape(3, 3))
+    volume, centre = float(total[0]), total[1:4] / total[0]
+    return MassProperties(volume, centre, total[4:].reshape(3, 3) - volume * _steiner(centre))
+
+
+def _steiner(centre: Array) -> Array:
+    """Return what the inertia of a unit mass at `centre` [3] is about the origin, [3, 3]."""
+    shifted: Array = centre @ centre * np.eye(3) - np.outer(centre, centre)
+    return shifted
 
 
 def _solid(part: trimesh.Trimesh) -> manifold3d.Manifold:
@@ -121,9 +113,9 @@ def _integrals(solid: manifold3d.Manifold) -> Array:
     # Integrated near the origin and moved back (Steiner): far from it the differences of large numbers lose digits.
     shift = corners.mean(axis=(0, 1))
     properties = trimesh.triangles.mass_properties(corners - shift)
-    volume, c = float(properties["volume"]), np.asarray(properties["center_mass"]) + shift
-    inertia = np.asarray(properties["inertia"]) + volume * (c @ c * np.eye(3) - np.outer(c, c))
-    return np.concatenate([[volume], volume * c, inertia.ravel()])
+    volume, centre = float(properties["volume"]), np.asarray(properties["center_mass"]) + shift
+    inertia = np.asarray(properties["inertia"]) + volume * _steiner(centre)
+    return np.concatenate([[volume], volume * centre, inertia.ravel()])
 
 
 def horizontal_axes(up: Array) -> Array:
@@ -135,32 +127,23 @@ def horizontal_axes(up: Array) -> Array:
 
 
 def principal_axes(inertia: Array) -> tuple[Array, Array]:
-    """Return the principal moments [3] and axes [3, 3] (columns, right-handed) of a symmetric tensor.
+    """Return the principal moments [3] and axes [3, 3] (columns, right-handed) of a symmetric tensor [3, 3].
 
-    Jacobi's rotations, in plain floats: they give the same bits on every machine, and where two moments coincide (a
-    cube, a cylinder) they leave the axes as they were built, where a library's eigenvectors would be arbitrary.
+    Jacobi's method: each axis stays nearest to the one that it was built along. Where moments coincide (a cube, a
+    cylinder) all stay as they were, where a library's eigenvectors would be arbitrary.
     """
     scale = float(np.abs(inertia).max())
-    a = [[round(float(inertia[i, j]) / scale, 7) for j in range(3)] for i in range(3)]
-    axes = [[float(i == j) for j in range(3)] for i in range(3)]
-    for _ in range(20):
-        for p, q in ((0, 1), (0, 2), (1, 2)):
-            _rotate(a, axes, p, q)
-    moments = np.array([a[i][i] for i in range(3)]) * scale
-    # Each axis stays nearest to the axis it was built along; a proper rotation needs no change of sign.
-    return moments, np.array(axes)
-
-
-def _rotate(a: list[list[float]], axes: list[list[float]], p: int, q: int) -> None:
-    """Zero the entry (p, q) of the symmetric `a` by the smaller of the two rotations, in place."""
-    # A coupling below the rounding of the entries says nothing; between equal moments it would turn the axes at random.
-    if abs(a[p][q]) < 2e-7:
-        return
-    theta = (a[q][q] - a[p][p]) / (2 * a[p][q])
-    t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1))
-    c = 1 / math.sqrt(t * t + 1)
-    s = t * c
-    for row in (*axes, *a):
-        row[p], row[q] = c * row[p] - s * row[q], s * row[p] + c * row[q]
-    for k in range(3):
-        a[p][k], a[q][k] = c * a[p][k] - s * a[q][k], s * a[p][k] + c * a[q][k]
+    moments, axes = np.round(inertia / scale, 7), np.eye(3)
+    for p, q in 20 * ((0, 1), (0, 2), (1, 2)):
+        # A coupling below the rounding says nothing; between equal moments it would turn the axes at random.
+        if abs(moments[p, q]) < 2e-7:
+            continue
+        # The smaller of the two rotations that make the coupling zero, by its tangent.
+        ratio = (moments[q, q] - moments[p, p]) / (2 * moments[p, q])
+        tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(ratio * ratio + 1))
+        turn = np.eye(3)
+        turn[p, p] = turn[q, q] = 1 / math.sqrt(tangent * tangent + 1)
+        turn[p, q] = tangent * turn[p, p]
+        turn[q, p] = -turn[p, q]
+        moments, axes = turn.T @ moments @ turn, axes @ turn
+    return moments.diagonal() * scale, axes

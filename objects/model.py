@@ -62,7 +62,7 @@ class Solid:
             UserError: too many parts lie inside each other; see `union_mass_properties`.
         """
         properties = union_mass_properties(parts)
-        moments, axes = principal_axes(properties.inertia_about_centre())
+        moments, axes = principal_axes(properties.inertia)
         # On a grid, so that a last-bit difference between machines cannot reach the vertices.
         centre = np.round(properties.centre, COORDINATE_DECIMALS)
         moved = tuple(

@@ -1,10 +1,8 @@
-"""The contact sheet of an object set: every object in its likeliest resting pose, at one scale, labelled.
-
-Drawn with matplotlib and `drawing.py`; it needs no simulator.
-"""
+"""The contact sheet of an object set: every object in its likeliest resting pose, at one scale, labelled."""
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,9 +16,8 @@ from graspq.objects.object_set import ObjectRecord, ObjectSet
 from graspq.objects.resting import resting_poses
 
 _CELL_PIXELS = 232
-_CELL_INCHES = 1.55
-_LABEL_INCHES = 0.42
-_HEAD_INCHES = 0.75
+# Inches: of a picture, of the label below it, of the heading.
+_CELL, _LABEL, _HEAD = 1.55, 0.42, 0.75
 _INK, _PALE = "#22262e", "#6b7280"
 
 
@@ -38,35 +35,38 @@ def contact_sheet(object_set: ObjectSet, out: Path, *, split: str | None = None,
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: expected a file name that ends in .png")
-    ids = object_set.ids(split)[:count]
-    figure = _figure(object_set, ids, f"split {split}" if split is not None else "all splits", split)
+    ids = object_set.ids(split)
+    which = f"split {split}" if split is not None else "all splits"
+    subtitle = f"{which} · {len(ids[:count])} of {len(ids)} · one scale"
+    figure = _figure(object_set, ids[:count], subtitle)
     try:
         with committed(out) as temporary:
-            figure.savefig(temporary, format="png", dpi=_CELL_PIXELS / _CELL_INCHES, facecolor=BACKGROUND)
+            figure.savefig(temporary, format="png", dpi=_CELL_PIXELS / _CELL, facecolor=BACKGROUND)
     except OSError as error:
         raise UserError(f"{out}: cannot write the picture here ({error.strerror}); choose another file") from None
-    return len(ids)
+    return len(ids[:count])
 
 
-def _figure(object_set: ObjectSet, ids: tuple[str, ...], which: str, split: str | None) -> Figure:
+def _figure(object_set: ObjectSet, ids: tuple[str, ...], subtitle: str) -> Figure:
     columns = _columns(len(ids))
-    rows = math.ceil(len(ids) / columns)
-    row_inches = _CELL_INCHES + _LABEL_INCHES
-    wide, high = max(columns, 3) * _CELL_INCHES, _HEAD_INCHES + rows * row_inches + 0.1
+    wide = max(columns, 3) * _CELL
+    high = _HEAD + math.ceil(len(ids) / columns) * (_CELL + _LABEL) + 0.1
     figure = Figure(figsize=(wide, high))
     scenes = {name: _scene(object_set, name) for name in ids}
+    # Metres across a picture.
     cover = 1.22 * max(_span(parts) for parts in scenes.values())
-    left = (wide - columns * _CELL_INCHES) / 2
     for place, name in enumerate(ids):
         row, column = divmod(place, columns)
-        bottom = high - _HEAD_INCHES - row * row_inches - _CELL_INCHES
-        corner = (left + column * _CELL_INCHES) / wide, bottom / high
-        axes = figure.add_axes((*corner, _CELL_INCHES / wide, _CELL_INCHES / high))
+        left, bottom = (wide - columns * _CELL) / 2 + column * _CELL, high - _HEAD - row * (_CELL + _LABEL) - _CELL
+        axes = figure.add_axes((left / wide, bottom / high, _CELL / wide, _CELL / high))
         axes.imshow(draw(scenes[name], object_set[name].color, _CELL_PIXELS, cover), interpolation="none")
         axes.set_axis_off()
         _label(axes, object_set[name])
-    total = len(object_set.ids(split))
-    _heading(figure, f"{object_set.name} objects", f"{which} · {len(ids)} of {total} · one scale", cover)
+    figure.text(
+        0.18 / wide, 1 - 0.17 / high, f"{object_set.name} objects", va="top", size=12, color=_INK, weight="bold"
+    )
+    figure.text(0.18 / wide, 1 - 0.43 / high, subtitle, va="top", size=7.5, color=_PALE)
+    _scale_bar(figure, cover)
     return figure
 
 
@@ -88,34 +88,25 @@ def _span(parts: list[trimesh.Trimesh]) -> float:
 
 
 def _label(axes: Axes, record: ObjectRecord) -> None:
-    names = dict.fromkeys(record.families)
-    counts = [f"{record.families.count(name)} {name}" if record.families.count(name) > 1 else name for name in names]
-    longest, grams = 100 * max(record.extents), 1000 * record.mass
-    lines = [
-        (record.object_id, 7.0, _INK, "bold"),
-        (" + ".join(counts), 5.2, _INK, "normal"),
-        (f"{longest:.1f} cm · {grams:.0f} g", 5.2, _PALE, "normal"),
-    ]
-    for number, (text, size, color, weight) in enumerate(lines):
-        axes.text(
-            0.5, 0.02 - 0.085 * number, text, transform=axes.transAxes, ha="center", va="top",
-            fontsize=size, color=color, fontweight=weight,
-        )  # fmt: skip
+    counts = {name: record.families.count(name) for name in record.families}
+    families = " + ".join(f"{count} {name}" if count > 1 else name for name, count in counts.items())
+    size = f"{100 * max(record.extents):.1f} cm · {1000 * record.mass:.0f} g"
+    style: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "top"}
+    axes.text(0.5, 0.02, record.object_id, size=7.0, color=_INK, weight="bold", **style)
+    axes.text(0.5, -0.065, families, size=5.2, color=_INK, **style)
+    axes.text(0.5, -0.15, size, size=5.2, color=_PALE, **style)
 
 
-def _heading(figure: Figure, title: str, subtitle: str, cover: float) -> None:
+def _scale_bar(figure: Figure, cover: float) -> None:
+    """Draw a bar as long as 5 or 10 cm across a picture; depth is foreshortened, widths are not."""
     wide, high = figure.get_size_inches()
-    figure.text(0.18 / wide, 1 - 0.17 / high, title, va="top", fontsize=12, color=_INK, fontweight="bold")
-    figure.text(0.18 / wide, 1 - 0.43 / high, subtitle, va="top", fontsize=7.5, color=_PALE)
-    # The bar is as long as 5 cm across the picture; depth is foreshortened, widths are not.
     centimetres = 5 if cover < 0.5 else 10
-    length = centimetres / 100 / cover * _CELL_INCHES
-    end, level = wide - 0.2, high - 0.36
+    right, level = wide - 0.2, high - 0.36
+    left = right - centimetres / 100 / cover * _CELL
     axes = figure.add_axes((0, 0, 1, 1), frameon=False)
+    axes.set(xlim=(0, wide), ylim=(0, high))
     axes.set_axis_off()
-    axes.set_xlim(0, wide)
-    axes.set_ylim(0, high)
-    axes.plot([end - length, end], [level, level], color=_INK, linewidth=1.6, solid_capstyle="butt")
-    for x in (end - length, end):
-        axes.plot([x, x], [level - 0.04, level + 0.04], color=_INK, linewidth=1.0)
-    axes.text(end - length / 2, level + 0.06, f"{centimetres} cm", ha="center", va="bottom", fontsize=7, color=_INK)
+    axes.errorbar(
+        (left + right) / 2, level, xerr=(right - left) / 2, color=_INK, elinewidth=1.6, capsize=3, capthick=1.0
+    )
+    axes.text((left + right) / 2, level + 0.06, f"{centimetres} cm", ha="center", va="bottom", size=7, color=_INK)

@@ -23,7 +23,7 @@ def test_a_box_has_the_volume_and_inertia_of_the_closed_form() -> None:
     np.testing.assert_allclose(properties.centre, [0.4, -0.2, 0.1], atol=1e-12)
     expected = volume / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
     # Steiner's theorem at 0.46 m costs four digits.
-    np.testing.assert_allclose(properties.inertia_about_centre(), np.diag(expected), atol=1e-10 * expected.max())
+    np.testing.assert_allclose(properties.inertia, np.diag(expected), atol=1e-10 * expected.max())
 
 
 def test_a_regular_prism_has_the_volume_and_inertia_of_the_closed_form_and_tends_to_the_cylinder() -> None:
@@ -31,15 +31,15 @@ def test_a_regular_prism_has_the_volume_and_inertia_of_the_closed_form_and_tends
     properties = union_mass_properties([_cylinder(radius, height, sides)])
     area = sides / 2 * radius**2 * math.sin(2 * math.pi / sides)
     second = area * radius**2 * (2 + math.cos(2 * math.pi / sides)) / 6  # polar second moment of a regular polygon
-    inertia = properties.inertia_about_centre()
+    inertia = properties.inertia
     assert properties.volume == pytest.approx(area * height, rel=1e-12)
     assert inertia[2, 2] == pytest.approx(second * height, rel=1e-9)
     assert inertia[0, 0] == pytest.approx(second * height / 2 + area * height**3 / 12, rel=1e-9)
     fine = union_mass_properties([_cylinder(radius, height, 720)])
     volume = math.pi * radius**2 * height
     assert fine.volume == pytest.approx(volume, rel=2e-5)
-    assert fine.inertia_about_centre()[2, 2] == pytest.approx(volume * radius**2 / 2, rel=4e-5)
-    assert fine.inertia_about_centre()[0, 0] == pytest.approx(volume * (3 * radius**2 + height**2) / 12, rel=4e-5)
+    assert fine.inertia[2, 2] == pytest.approx(volume * radius**2 / 2, rel=4e-5)
+    assert fine.inertia[0, 0] == pytest.approx(volume * (3 * radius**2 + height**2) / 12, rel=4e-5)
 
 
 def test_what_two_crossing_bars_share_counts_once() -> None:
@@ -47,7 +47,7 @@ def test_what_two_crossing_bars_share_counts_once() -> None:
     properties = union_mass_properties([cuboid((long, wide, wide)), cuboid((wide, long, wide))])
     assert properties.volume == pytest.approx(2 * long * wide**2 - wide**3, rel=1e-9)
     bars = (long * wide**2 / 12) * (long**2 + wide**2) * 2 - wide**3 / 12 * (2 * wide**2)
-    assert properties.inertia_about_centre()[2, 2] == pytest.approx(bars, rel=1e-9)
+    assert properties.inertia[2, 2] == pytest.approx(bars, rel=1e-9)
 
 
 def test_three_crossing_bars_need_the_triple_intersection() -> None:
@@ -104,5 +104,5 @@ def test_principal_axes_diagonalise_and_turn_right_handed() -> None:
 
 
 def test_a_cube_keeps_the_axes_it_was_built_along() -> None:
-    _, axes = principal_axes(union_mass_properties([cuboid((1, 1, 1))]).inertia_about_centre())
+    _, axes = principal_axes(union_mass_properties([cuboid((1, 1, 1))]).inertia)
     np.testing.assert_array_equal(axes, np.eye(3))

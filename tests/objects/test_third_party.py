@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,7 @@ import trimesh
 
 from graspq.common.errors import UserError
 from graspq.objects.geometry import half_spaces, union_mass_properties
-from graspq.objects.third_party import coarse_hull, import_meshes, splits_of
+from graspq.objects.third_party import import_meshes, splits_of
 
 BOX = (0.03, 0.05, 0.08)
 
@@ -111,6 +112,16 @@ def test_the_layout_of_random_urdfs_is_read_with_scale_mass_and_colour(source: P
     assert denser["001"].mass == pytest.approx(1000 * record.volume, rel=1e-6)
 
 
+def test_objects_of_pybullet_data_are_imported_and_the_empty_one_is_left_out(source: Path, tmp_path: Path) -> None:
+    data = pytest.importorskip("pybullet_data")
+    for name in ("167", "168", "170"):
+        shutil.copytree(Path(data.getDataPath()) / "random_urdfs" / name, source / name)
+    lines: list[str] = []
+    made = import_meshes(source, tmp_path / "set", left_out=lines.append)
+    assert {name: made[name].split for name in made.ids()} == {"167": "train", "170": "test"}
+    assert [line.split("/")[-1][:7] for line in lines] == ["168.obj"]
+
+
 def test_the_origin_and_turn_of_a_urdf_shape_place_its_mesh(source: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.02, 0.02, 0.06)).export(source / "bar.stl")
     origin = '<origin xyz="0.05 0 0" rpy="0 1.5707963267948966 0"/>'
@@ -139,16 +150,6 @@ def test_a_tenth_of_other_names_is_held_out_and_an_added_object_moves_none_into_
         assert not [name for name, split in known.items() if split == "train" and splits[name] == "test"]
         known = splits
     assert splits_of(["cup"]) == {"cup": "train"}
-
-
-def test_a_hull_of_many_corners_is_coarsened_to_within_2_percent_and_a_small_one_is_exact() -> None:
-    ball = trimesh.creation.icosphere(4, 0.04)
-    coarse = coarse_hull(ball.vertices)
-    assert len(coarse.vertices) <= 64
-    np.testing.assert_allclose(np.ptp(coarse.vertices, axis=0), 0.08, rtol=0.03)
-    assert coarse.volume > 0.88 * ball.volume
-    box = trimesh.creation.box(BOX)
-    assert coarse_hull(box.vertices).volume == pytest.approx(np.prod(BOX))
 
 
 def test_a_mesh_of_three_metres_is_refused_and_the_advised_scale_works(source: Path, tmp_path: Path) -> None:
