@@ -111,6 +111,20 @@ def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> d
         raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
 
 
+def read_episode_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of an episodes table; columns as in `columns.EPISODES`.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    try:
+        table = pq.read_table(path, page_checksum_verification=True, use_threads=False, partitioning=None)
+        rows: list[dict[str, Any]] = table.to_pylist()
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
+    return rows
+
+
 def relabelled(block: BlockArrays, discount: float) -> BlockArrays:
     """Return the block with `mc_return` made anew from its rewards, with another discount γ in [0, 1]."""
     records = block.records.copy()

@@ -86,14 +86,14 @@ def verify(settings: VerifySettings) -> int:
 def show(settings: ShowSettings) -> None:
     """Draw film strips of some episodes with their actions and labels."""
     # Imported late: the other commands must not wait for matplotlib.
-    from graspq.datasets.show import choose_strips, save_strips
+    from graspq.datasets.show import choose_episodes, save_strips
 
     dataset = Dataset.open(settings.path)
     outcome = None if settings.success == settings.failure else settings.success
-    strips = choose_strips(dataset, settings.episodes, settings.seed, outcome)
+    episodes = choose_episodes(dataset, settings.episodes, settings.seed, outcome)
     name = settings.path.resolve().name
-    save_strips(settings.out, strips, dataset.manifest.action.names, f"{dataset.manifest.task_name} grasping · {name}")
-    click.echo(f"{settings.out}: {counted(len(strips), 'episode')}")
+    save_strips(settings.out, episodes, dataset.manifest, f"{dataset.manifest.task_name} grasping · {name}")
+    click.echo(f"{settings.out}: {counted(len(episodes), 'episode')}")
 
 
 def _described(path: Path, manifest: Manifest) -> dict[str, str]:

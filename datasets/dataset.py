@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.datasets.blocks import REMEDY, BlockRef
+from graspq.datasets.blocks import REMEDY, BlockRef, read_episode_rows
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
 from graspq.datasets.pool import ShardPool
 
@@ -44,20 +44,14 @@ class Dataset:
         return _pool([(self, entry)], str(self.folder), verify)
 
     def episode_rows(self, entry: ShardEntry, verify: bool = True) -> list[dict[str, Any]]:
-        """Return the rows of a shard's episodes table, columns as in `schema.episodes_schema`.
+        """Return the rows of a shard's episodes table, columns as in `columns.EPISODES`.
 
         Raises:
             UserError: the file is missing or damaged.
         """
         path = episodes_file(entry.name)
         check_file(self.folder, entry, path, verify)
-        try:
-            rows: list[dict[str, Any]] = pq.read_table(
-                self.folder / path, page_checksum_verification=True, use_threads=False, partitioning=None
-            ).to_pylist()
-        except (OSError, pa.ArrowException, ValueError) as error:
-            raise UserError(f"{self.folder / path}: cannot be read ({_one_line(error)}); {REMEDY}") from None
-        return rows
+        return read_episode_rows(self.folder / path)
 
 
 def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPool:

@@ -7,14 +7,10 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.blocks import REMEDY, BlockRef
 from graspq.datasets.episode import Episode
 from graspq.datasets.loader import (
     EpisodeLoader,
@@ -92,29 +88,7 @@ class Grasps:
             raise IndexError(f"episode {number}: there are {self.episodes}")
         number %= self.episodes
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
-        ref = self.pool.blocks[index]
-        within = number - int(self._starts[index])
-        block, row = self.pool.read_block(ref), _episode_rows(ref)[within]
-        first = int(block.first_rows[within])
-        steps = slice(first, first + int(block.lengths[within]))
-        records = block.records[steps]
-        return Episode(
-            episode_id=row["episode_id"],
-            block=row["block"],
-            seed=row["seed"],
-            object_ids=tuple(row["object_ids"]),
-            object_poses=np.array(row["object_poses"], np.float32).reshape(-1, 7),
-            images=block.images[steps].copy(),
-            actions=np.ascontiguousarray(records["action"]),
-            rewards=np.ascontiguousarray(records["reward"]),
-            gripper_poses=np.ascontiguousarray(records["gripper_pose"]),
-            final_pose=np.array(row["final_pose"], np.float32),
-            end=row["end"],
-            success=row["success"],
-            lifted_object=row["lifted_object"],
-            policy=row["policy"],
-            exploration=row["exploration"],
-        )
+        return self.pool.episode(self.pool.blocks[index], number - int(self._starts[index]))
 
     def split(self, fraction: float = 0.1, seed: int = 0) -> tuple["Grasps", "Grasps"]:
         """Return (training, held back): whole blocks, which share their objects, are held back; see `ShardPool.split`.
@@ -192,18 +166,3 @@ class Grasps:
         from graspq.datasets.torch_dataset import TorchDataset
 
         return TorchDataset(self, batch_size, seed, view, options)
-
-
-def _episode_rows(ref: BlockRef) -> list[dict[str, Any]]:
-    """Return the rows of a block's episodes.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
-    path = ref.path.parent.parent / "episodes" / ref.path.name
-    try:
-        table = pq.read_table(path, page_checksum_verification=True, use_threads=False, partitioning=None)
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
-    rows: list[dict[str, Any]] = table.filter(pc.field("block") == ref.block).to_pylist()
-    return rows

@@ -11,7 +11,6 @@ import queue
 import threading
 import weakref
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from types import TracebackType
 from typing import Generic, Self, TypeVar
@@ -19,7 +18,7 @@ from typing import Generic, Self, TypeVar
 import numpy as np
 
 from graspq.datasets.batch import EpisodeBatch, Int64, TransitionBatch
-from graspq.datasets.blocks import BlockArrays
+from graspq.datasets.buffer import BlockBuffer
 from graspq.datasets.gather import Blocks, gather_episodes, gather_transitions, located
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
@@ -27,61 +26,7 @@ from graspq.datasets.sampler import Sampler
 B = TypeVar("B")
 # Blocks in memory, the block of each item, its number within it → the batch.
 Gather = Callable[[Blocks, list[int], list[int]], B]
-READERS = min(4, os.cpu_count() or 1)
 DEFAULT_BUFFER_BYTES = 4 * 2**30
-
-
-class _Buffer:
-    """The blocks in memory, by their index in the pool, and those that are being read."""
-
-    def __init__(self, pool: ShardPool) -> None:
-        self._pool = pool
-        self._readers = ThreadPoolExecutor(READERS, "graspq-reader")
-        self._asked: dict[int, Future[BlockArrays]] = {}
-        self.blocks: Blocks = {}
-        self.bytes = self.peak_bytes = 0
-
-    def missing(self, wanted: Int64) -> list[int]:
-        """Return which blocks are neither here nor asked for."""
-        return [index for index in wanted.tolist() if index not in self.blocks and index not in self._asked]
-
-    def ask(self, indices: list[int]) -> None:
-        """Let the readers begin with some blocks."""
-        for index in indices:
-            self._asked[index] = self._readers.submit(self._pool.read_block, self._pool.blocks[index])
-
-    def receive(self, but: int = 0) -> None:
-        """Wait for the blocks that were asked for, but for the last few.
-
-        Raises:
-            UserError: one is damaged.
-        """
-        for index in list(self._asked)[: max(0, len(self._asked) - but)]:
-            block = self._asked[index].result()
-            self.blocks[index] = block
-            del self._asked[index]
-            self.bytes += block.bytes
-            self.peak_bytes = max(self.peak_bytes, self.bytes)
-
-    def read(self, wanted: Int64) -> None:
-        """Wait until all of these blocks are here."""
-        self.ask(self.missing(wanted))
-        self.receive()
-
-    def keep(self, wanted: set[int]) -> None:
-        """Forget all blocks but these."""
-        for index in self.blocks.keys() - wanted:
-            self.bytes -= self.blocks.pop(index).bytes
-
-    def cancel(self) -> None:
-        """Begin no further block; whoever waits for one gets `CancelledError`."""
-        self._readers.shutdown(wait=False, cancel_futures=True)
-
-    def close(self) -> None:
-        """Stop the readers and forget all blocks."""
-        self._readers.shutdown(cancel_futures=True)
-        self._asked.clear()
-        self.keep(set())
 
 
 class _Source(Generic[B]):
@@ -89,7 +34,7 @@ class _Source(Generic[B]):
 
     def __init__(self, pool: ShardPool, sampler: Sampler, gather: Gather[B]) -> None:
         self._sampler, self._gather = sampler, gather
-        self.buffer = _Buffer(pool)
+        self.buffer = BlockBuffer(pool)
 
     def batches(self, start_step: int, every: int) -> Iterator[B]:
         """Yield the batch of every `every`-th global step from `start_step` on, without end."""
@@ -307,7 +252,7 @@ def episode_batches(pool: ShardPool, batch_size: int, max_steps: int | None = No
 
 def _in_order(pool: ShardPool, counts: list[int], batch_size: int, gather: Gather[B]) -> Iterator[B]:
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    with contextlib.closing(_Buffer(pool)) as buffer:
+    with contextlib.closing(BlockBuffer(pool)) as buffer:
         for start in range(0, int(offsets[-1]), batch_size):
             owners, numbers = located(offsets, np.arange(start, min(start + batch_size, int(offsets[-1]))))
             buffer.keep(set(owners))

@@ -6,10 +6,24 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
-from graspq.datasets.blocks import BlockArrays, BlockRef, read_block, read_columns, relabelled, row_bytes
+from graspq.datasets.blocks import (
+    BlockArrays,
+    BlockRef,
+    read_block,
+    read_columns,
+    read_episode_rows,
+    relabelled,
+    row_bytes,
+)
 from graspq.datasets.columns import sizes_of
+from graspq.datasets.episode import Episode
+
+# Attributes of an episode that the episodes table holds as they are.
+AS_THEY_ARE = ("episode_id", "block", "seed", "end", "success", "lifted_object", "policy", "exploration")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +88,29 @@ class ShardPool:
     def read_columns(self, ref: BlockRef, names: Sequence[str]) -> dict[str, Any]:
         """Return some stored columns of a block; see `blocks.read_columns`."""
         return read_columns(ref, names, self._footers.get(ref.path))
+
+    def episode(self, ref: BlockRef, number: int) -> Episode:
+        """Return episode `number` of a block, counted from 0.
+
+        Raises:
+            UserError: a file is missing or damaged.
+        """
+        block = self.read_block(ref)
+        rows = read_episode_rows(ref.path.parent.parent / "episodes" / ref.path.name)
+        row = [row for row in rows if row["block"] == ref.block][number]
+        first = int(block.first_rows[number])
+        steps = slice(first, first + int(block.lengths[number]))
+        records = block.records[steps]
+        return Episode(
+            images=block.images[steps].copy(),
+            actions=np.ascontiguousarray(records["action"]),
+            rewards=np.ascontiguousarray(records["reward"]),
+            gripper_poses=np.ascontiguousarray(records["gripper_pose"]),
+            object_ids=tuple(row["object_ids"]),
+            object_poses=np.array(row["object_poses"], np.float32).reshape(-1, 7),
+            final_pose=np.array(row["final_pose"], np.float32),
+            **{name: row[name] for name in AS_THEY_ARE},
+        )
 
     def with_discount(self, discount: float) -> "ShardPool":
         """Return the pool with `mc_return` made from the rewards with γ in [0, 1], where that is not the stored one."""

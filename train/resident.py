@@ -15,7 +15,7 @@ from torch import Tensor
 from graspq.common.errors import UserError
 from graspq.datasets.batch import Int64
 from graspq.datasets.blocks import BlockArrays
-from graspq.datasets.loader import READERS
+from graspq.datasets.buffer import READERS
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 
