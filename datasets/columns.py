@@ -67,8 +67,9 @@ class EpisodeColumn(Column):
     value: Callable[[Episode], Any] | None = None
 
     def of(self, episode: Episode) -> Any:
-        """Return its value in the row of an episode."""
-        return getattr(episode, self.name) if self.value is None else self.value(episode)
+        """Return its value in the row of an episode, arrays as lists."""
+        value = getattr(episode, self.name) if self.value is None else self.value(episode)
+        return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +88,6 @@ class StepColumn(Column):
     batches: bool = True
 
 
-def _action(manifest: Manifest) -> dict[str, Any]:
-    action = manifest.action
-    return {"order": list(action.names), "unit": "action_limits", "action_limits": list(action.limits)}
-
-
-def _pose(manifest: Manifest) -> dict[str, Any]:
-    return {"order": list(manifest.action.pose), "unit": list(manifest.action.units)}
-
-
 def phi_range(manifest: Manifest) -> dict[str, Any]:
     """Return the range of the wrist's angle as metadata, where a pose has one."""
     return {} if manifest.phi_range is None else {"phi_range": list(manifest.phi_range)}
@@ -105,109 +97,85 @@ def _image(manifest: Manifest) -> dict[str, Any]:
     return {"shape": list(manifest.image_shape), "dtype": "uint8", "layout": "H W C", "color": "RGB"}
 
 
-STEPS = (
-    StepColumn(
-        "episode_id",
-        "int64",
-        (),
-        "number of the attempt",
-        label=lambda steps, episode, manifest: np.full(episode["steps"], episode["episode_id"]),
-    ),
-    StepColumn(
-        "step",
-        "int32",
-        (),
-        "number of the step in its attempt, from 0",
-        label=lambda steps, episode, manifest: np.arange(episode["steps"]),
-    ),
-    StepColumn(
-        "image",
-        "uint8",
-        ("H", "W", "C"),
-        "RGB before the action, {height} x {width} x 3 uint8, row by row",
-        _image,
-        value=lambda episode: episode.images,
-    ),
-    StepColumn(
-        "action",
-        "float32",
-        ("A",),
-        "{action} in units of the action limits, in [-1, 1]",
-        _action,
-        value=lambda episode: episode.actions,
-    ),
-    StepColumn(
-        "reward",
-        "float32",
-        (),
-        "1 for a successful grasp, at the last step only",
-        value=lambda episode: episode.rewards,
-    ),
-    StepColumn(
-        "terminal",
-        "bool",
-        (),
-        "whether this is the last step; the next image of every other row is that of the next row",
-        label=lambda steps, episode, manifest: np.arange(episode["steps"]) == episode["steps"] - 1,
-    ),
-    StepColumn(
-        "gripper_pose",
-        "float32",
-        ("A",),
-        "{pose} before the action, angles unwrapped",
-        lambda manifest: _pose(manifest) | phi_range(manifest),
-        value=lambda episode: episode.gripper_poses,
-    ),
-    StepColumn(
-        "mc_return",
-        "float32",
-        (),
-        "discounted return from this step on, discount {discount}",
-        lambda manifest: {"discount": manifest.discount},
-        label=lambda steps, episode, manifest: mc_return(steps["reward"], manifest.discount),
-    ),
-    StepColumn(
-        "synthetic_action",
-        "float32",
-        ("A",),
-        "final pose minus this pose, in the units of `action`",
-        _action,
-        label=lambda steps, episode, manifest: synthetic_action(
-            steps["gripper_pose"], np.asarray(episode["final_pose"], np.float32), manifest.action_limits
-        ),
-    ),
-)
+def _action(manifest: Manifest) -> dict[str, Any]:
+    limits = list(manifest.action.limits)
+    return {"order": list(manifest.action.names), "unit": "action_limits", "action_limits": limits}
 
+
+def _pose(manifest: Manifest) -> dict[str, Any]:
+    return {"order": list(manifest.action.pose), "unit": list(manifest.action.units)}
+
+
+def _gripper_pose(manifest: Manifest) -> dict[str, Any]:
+    return _pose(manifest) | phi_range(manifest)
+
+
+def _object_pose(manifest: Manifest) -> dict[str, Any]:
+    return {"order": ["x", "y", "z", "qx", "qy", "qz", "qw"], "unit": "m, unit quaternion"}
+
+
+def _discount(manifest: Manifest) -> dict[str, Any]:
+    return {"discount": manifest.discount}
+
+
+def _episode_id(steps: Row, episode: Row, manifest: Manifest) -> Any:
+    return np.full(episode["steps"], episode["episode_id"])
+
+
+def _step(steps: Row, episode: Row, manifest: Manifest) -> Any:
+    return np.arange(episode["steps"])
+
+
+def _terminal(steps: Row, episode: Row, manifest: Manifest) -> Any:
+    return np.arange(episode["steps"]) == episode["steps"] - 1
+
+
+def _mc_return(steps: Row, episode: Row, manifest: Manifest) -> Any:
+    return mc_return(steps["reward"], manifest.discount)
+
+
+def _synthetic_action(steps: Row, episode: Row, manifest: Manifest) -> Any:
+    final_pose = np.asarray(episode["final_pose"], np.float32)
+    return synthetic_action(steps["gripper_pose"], final_pose, manifest.action_limits)
+
+
+# fmt: off
+STEPS = (
+    StepColumn("episode_id", "int64", (), "number of the attempt", label=_episode_id),
+    StepColumn("step", "int32", (), "number of the step in its attempt, from 0", label=_step),
+    StepColumn("image", "uint8", ("H", "W", "C"), "RGB before the action, {height} x {width} x 3 uint8, row by row",
+               _image, value=lambda episode: episode.images),
+    StepColumn("action", "float32", ("A",), "{action} in units of the action limits, in [-1, 1]",
+               _action, value=lambda episode: episode.actions),
+    StepColumn("reward", "float32", (), "1 for a successful grasp, at the last step only",
+               value=lambda episode: episode.rewards),
+    StepColumn("terminal", "bool", (),
+               "whether this is the last step; the next image of every other row is that of the next row",
+               label=_terminal),
+    StepColumn("gripper_pose", "float32", ("A",), "{pose} before the action, angles unwrapped",
+               _gripper_pose, value=lambda episode: episode.gripper_poses),
+    StepColumn("mc_return", "float32", (), "discounted return from this step on, discount {discount}",
+               _discount, label=_mc_return),
+    StepColumn("synthetic_action", "float32", ("A",), "final pose minus this pose, in the units of `action`",
+               _action, label=_synthetic_action),
+)
 EPISODES = (
     EpisodeColumn("episode_id", "int64", (), "number of the attempt"),
     EpisodeColumn("block", "int64", (), "number of its block: attempts that share their objects"),
     EpisodeColumn("seed", "int64", (), "seed of its scene"),
     EpisodeColumn("object_ids", "string", ("K",), "the objects in the bin, files in `objects/`"),
-    EpisodeColumn(
-        "object_poses",
-        "float32",
-        ("K", 7),
-        "x, y, z (m), qx, qy, qz, qw of each after settling",
-        lambda manifest: {"order": ["x", "y", "z", "qx", "qy", "qz", "qw"], "unit": "m, unit quaternion"},
-        value=lambda episode: episode.object_poses.tolist(),
-    ),
+    EpisodeColumn("object_poses", "float32", ("K", 7), "x, y, z (m), qx, qy, qz, qw of each after settling",
+                  _object_pose),
     EpisodeColumn("steps", "int32", (), "number of steps"),
-    EpisodeColumn(
-        "end", "string", (), "`height`: the gripper went below the height threshold; `T`: the last allowed step"
-    ),
+    EpisodeColumn("end", "string", (),
+                  "`height`: the gripper went below the height threshold; `T`: the last allowed step"),
     EpisodeColumn("success", "bool", (), "whether the attempt succeeded"),
     EpisodeColumn("lifted_object", "string", (), "what was lifted, if anything", nullable=True),
     EpisodeColumn("policy", "string", (), "what acted"),
     EpisodeColumn("exploration", "float64", (), "its exploration parameter"),
-    EpisodeColumn(
-        "final_pose",
-        "float32",
-        ("A",),
-        "{pose} after the last action, before the scripted descent",
-        _pose,
-        value=lambda episode: episode.final_pose.tolist(),
-    ),
+    EpisodeColumn("final_pose", "float32", ("A",), "{pose} after the last action, before the scripted descent", _pose),
 )
+# fmt: on
 
 
 def sizes_of(image_shape: tuple[int, int, int], action: ActionSpace) -> Sizes:
