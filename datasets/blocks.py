@@ -3,6 +3,7 @@
 Page checksums are verified on every read. Dimension key: N rows of the block, H W C image.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.datasets.batch import Bool, Int64, Records
-from graspq.datasets.columns import Sizes, record_dtype
+from graspq.datasets.columns import RecordType
 from graspq.datasets.episode import UInt8
 from graspq.datasets.labels import mc_return
 
@@ -60,23 +61,37 @@ class BlockArrays:
     first_rows: Int64
     lengths: Int64
 
+    @functools.cached_property
+    def opaque(self) -> Records:
+        """The records as plain bytes [N]: numpy copies one in a tenth of the time that it takes field by field."""
+        return opaque(self.records)
+
+    @functools.cached_property
+    def next_rows(self) -> list[int]:
+        """The row of each row's s′; its own where it is terminal."""
+        following: list[int] = (np.arange(len(self.records)) + ~self.records["terminal"]).tolist()
+        return following
+
     @property
     def bytes(self) -> int:
         """Memory that it holds."""
         return self.images.nbytes + self.records.nbytes
 
 
-def row_bytes(sizes: Sizes) -> int:
-    """Return the memory of one row of a `BlockArrays`."""
-    return sizes["H"] * sizes["W"] * sizes["C"] + record_dtype(sizes).itemsize
+def opaque(records: Records) -> Records:
+    """Return a view of records as plain bytes, each a `void` of their size."""
+    return records.view(np.dtype((np.void, records.dtype.itemsize)))
 
 
-def read_block(ref: BlockRef, sizes: Sizes, metadata: Any = None) -> BlockArrays:
+def read_block(
+    ref: BlockRef, image_shape: tuple[int, int, int], dtype: RecordType, metadata: Any = None
+) -> BlockArrays:
     """Return the rows of a block.
 
     Args:
         ref: the block.
-        sizes: see `columns.sizes_of`.
+        image_shape: (H, W, C).
+        dtype: of the records, see `columns.record_dtype`.
         metadata: the file's footer where it was read before.
 
     Raises:
@@ -85,7 +100,7 @@ def read_block(ref: BlockRef, sizes: Sizes, metadata: Any = None) -> BlockArrays
     try:
         with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
             table = file.read_row_group(ref.row_group, use_threads=False)
-        return _block_arrays(ref, table, sizes)
+        return _block_arrays(ref, table, image_shape, dtype)
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
@@ -134,9 +149,9 @@ def relabelled(block: BlockArrays, discount: float) -> BlockArrays:
     return replace(block, records=records)
 
 
-def _block_arrays(ref: BlockRef, table: pa.Table, sizes: Sizes) -> BlockArrays:
-    records = np.zeros(table.num_rows, record_dtype(sizes))
-    for name in (records.dtype.names or ())[:-1]:
+def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, int], dtype: RecordType) -> BlockArrays:
+    records = np.zeros(table.num_rows, dtype)
+    for name in (dtype.names or ())[:-1]:
         records[name] = _numpy(table.column(name))
     records["block"] = ref.block
     terminal: Bool = records["terminal"]
@@ -145,7 +160,7 @@ def _block_arrays(ref: BlockRef, table: pa.Table, sizes: Sizes) -> BlockArrays:
         raise ValueError(f"expected {ref.rows} rows of {ref.episodes} whole episodes")
     return BlockArrays(
         block=ref.block,
-        images=_numpy(table.column("image")).reshape(-1, *(sizes[letter] for letter in "HWC")),
+        images=_numpy(table.column("image")).reshape(-1, *image_shape),
         records=records,
         first_rows=first_rows,
         lengths=np.diff(np.append(first_rows, table.num_rows)),

@@ -19,6 +19,7 @@ from graspq.datasets.manifest import Manifest
 
 Row = Mapping[str, Any]
 Sizes = Mapping[str, int]
+RecordType = np.dtype[np.void]
 VARYING = -1
 
 
@@ -183,8 +184,9 @@ def sizes_of(image_shape: tuple[int, int, int], action: ActionSpace) -> Sizes:
     return {"A": action.size, "K": VARYING, **dict(zip("HWC", image_shape, strict=True))}
 
 
-def record_dtype(sizes: Sizes) -> np.dtype[np.void]:
+def record_dtype(image_shape: tuple[int, int, int], action: ActionSpace) -> RecordType:
     """Return the type of one step in memory, all its columns but the image; integers as int64, as torch indexes."""
+    sizes = sizes_of(image_shape, action)
     columns = [column for column in STEPS if column.name != "image"]
     fields = [(column.name, column.dtype.replace("int32", "int64"), column.dimensions(sizes)) for column in columns]
     return np.dtype([*fields, ("block", "int64")])

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from graspq.datasets.batch import EpisodeBatch, Int64, TransitionBatch, episode_batch, transition_batch
-from graspq.datasets.blocks import BlockArrays
+from graspq.datasets.blocks import BlockArrays, opaque
 from graspq.datasets.episode import UInt8
 
 Blocks = dict[int, BlockArrays]
@@ -21,12 +21,13 @@ def gather_transitions(blocks: Blocks, owners: list[int], rows: list[int], need_
     image = _room((len(rows), *shape))
     next_image = _room((len(rows), *shape)) if need_next else None
     records = np.empty(len(rows), blocks[owners[0]].records.dtype)
+    copied = opaque(records)
     for index, (owner, row) in enumerate(zip(owners, rows, strict=True)):
         block = blocks[owner]
         image[index] = block.images[row]
-        records[index] = record = block.records[row]
         if next_image is not None:
-            next_image[index] = block.images[row + (not record["terminal"])]
+            next_image[index] = block.images[block.next_rows[row]]
+        copied[index] = block.opaque[row]
     return transition_batch(image, next_image, records)
 
 
@@ -39,6 +40,7 @@ def gather_episodes(blocks: Blocks, owners: list[int], numbers: list[int], max_s
     shape = blocks[owners[0]].images.shape[1:]
     image = _room((len(numbers), max_steps, *shape))
     records = np.zeros((len(numbers), max_steps), blocks[owners[0]].records.dtype)
+    copied = opaque(records)
     mask = np.zeros((len(numbers), max_steps), np.bool_)
     for index, (owner, number) in enumerate(zip(owners, numbers, strict=True)):
         block = blocks[owner]
@@ -47,7 +49,7 @@ def gather_episodes(blocks: Blocks, owners: list[int], numbers: list[int], max_s
             raise ValueError(f"max_steps: expected at least {length}, the length of an episode, got {max_steps}")
         image[index, :length] = block.images[first : first + length]
         image[index, length:] = 0
-        records[index, :length] = block.records[first : first + length]
+        copied[index, :length] = block.opaque[first : first + length]
         mask[index, :length] = True
     return episode_batch(image, records, mask)
 

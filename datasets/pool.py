@@ -1,6 +1,8 @@
 """What training reads: blocks of one task, image shape, action space and discount, from any number of datasets."""
 
+import functools
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,9 +19,8 @@ from graspq.datasets.blocks import (
     read_columns,
     read_episode_rows,
     relabelled,
-    row_bytes,
 )
-from graspq.datasets.columns import sizes_of
+from graspq.datasets.columns import RecordType, record_dtype
 from graspq.datasets.episode import Episode
 
 # Attributes of an episode that the episodes table holds as they are.
@@ -73,7 +74,11 @@ class ShardPool:
     @property
     def row_bytes(self) -> int:
         """Memory of one step when it is read."""
-        return row_bytes(sizes_of(self.image_shape, self.action))
+        return math.prod(self.image_shape) + self._record.itemsize
+
+    @functools.cached_property
+    def _record(self) -> RecordType:
+        return record_dtype(self.image_shape, self.action)
 
     @property
     def folders(self) -> tuple[Path, ...]:
@@ -82,7 +87,7 @@ class ShardPool:
 
     def read_block(self, ref: BlockRef) -> BlockArrays:
         """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""
-        block = read_block(ref, sizes_of(self.image_shape, self.action), self._footers.get(ref.path))
+        block = read_block(ref, self.image_shape, self._record, self._footers.get(ref.path))
         return relabelled(block, self.discount) if self._relabels else block
 
     def read_columns(self, ref: BlockRef, names: Sequence[str]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from graspq.common.errors import UserError
 from graspq.common.files import LOCK_NAME, read_json, sha256_of
 from graspq.datasets.blocks import BlockRef, read_block
-from graspq.datasets.columns import sizes_of, wrong_labels
+from graspq.datasets.columns import record_dtype, wrong_labels
 from graspq.datasets.dataset import Dataset, check_file
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
 from graspq.datasets.tables import episodes_schema, steps_schema
@@ -191,7 +191,7 @@ def _content(dataset: Dataset, entry: ShardEntry) -> Iterator[str]:
 
 
 def _block(manifest: Manifest, ref: BlockRef, episodes: list[dict[str, Any]]) -> Iterator[str]:
-    arrays = read_block(ref, sizes_of(manifest.image_shape, manifest.action))
+    arrays = read_block(ref, manifest.image_shape, record_dtype(manifest.image_shape, manifest.action))
     if arrays.lengths.tolist() != [row["steps"] for row in episodes]:
         yield "the lengths of its episodes are not those of the episodes table"
         return
