@@ -1,9 +1,7 @@
 """Resting poses of a rigid body on a floor: how likely each is, how high the body stands, how wide a gripper must open.
 
-Quasi-static: the body falls in a uniformly random orientation, lands on the face below its centre of mass and tips over
-edges until that centre lies above the face it stands on.
-
-Dimension key: V points, F triangles of the convex hull.
+Quasi-static: it falls in a random orientation, lands on the face below its centre of mass and tips over edges until
+that centre lies above the face it stands on. Dimension key: V points, F triangles of the convex hull.
 """
 
 import dataclasses
