@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from graspq.common.options import setting
 from graspq.train.batch import Batch
-from graspq.train.estimator import Estimator, Metrics, loss_of, targets_of
+from graspq.train.estimator import Estimator, Metrics, TargetValue, loss_of, targets_of
 from graspq.train.estimators import dql
 from graspq.train.networks.network import Features, NetworkSpecification, QNetwork
-from graspq.train.selection import uniform_actions
+from graspq.train.selection import StochasticSearch, uniform_actions
 from graspq.train.state import TrainState
 
 
@@ -77,10 +77,11 @@ def conservative_update(
     return {name: value.detach() for name, value in metrics.items()}
 
 
-conservative = dataclasses.replace(
-    dql.ROW,
+conservative = Estimator(
     summary="Double Q-learning with a penalty on Q of random actions",
     settings=ConservativeSettings,
+    target_value=TargetValue("bootstrapped (double Q), conservative", dql.target, needs_next=True),
+    action_selection=StochasticSearch(),
     paper=ConservativeSettings(loss="squared"),
     parts={"q": SmallNetwork},
     update=conservative_update,

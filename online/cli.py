@@ -12,7 +12,7 @@ import click
 from graspq.common.errors import UserError
 from graspq.common.options import given_options, parameters, with_version
 from graspq.online.settings import OnlineSettings
-from graspq.train.cli import TrainingCommand, value_of
+from graspq.train.options import TrainingCommand, value_of
 from graspq.train.run import Run
 
 

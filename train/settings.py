@@ -9,10 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import click
-
 from graspq.common.errors import UserError
-from graspq.common.options import Settings, flag, parameters, setting, shown_value
+from graspq.common.options import Settings, flag, setting
 from graspq.datasets.loader import DEFAULT_BUFFER_BYTES
 from graspq.train.estimator import Estimator, EstimatorSettings
 from graspq.train.estimators import ESTIMATORS, estimator_named
@@ -141,52 +139,13 @@ def _changed(values: dict[str, Any], kinds: Mapping[str, Settings], given: Mappi
 def unknown_option(option: str, algo: str, network: str) -> str:
     """Return what to say of an option that neither the common ones, the estimator nor the networks have."""
     name = option.removeprefix("--no-").removeprefix("--").replace("-", "_")
-    owners = [f"--algo {row}" for row, one in ESTIMATORS.items() if name in _names(one.settings)]
-    owners += [f"--network {row}" for row, one in NETWORKS.items() if name in _names(one.settings)]
+    owners = [f"--algo {row}" for row, one in ESTIMATORS.items() if name in names_of(one.settings)]
+    owners += [f"--network {row}" for row, one in NETWORKS.items() if name in names_of(one.settings)]
     if not owners:
         return f"No such option: {option} (with --algo {algo} and --network {network})"
     return f"{option} belongs to {', '.join(owners)}; it is no option of --algo {algo} with --network {network}"
 
 
-def _names(kind: type[Settings]) -> set[str]:
+def names_of(kind: type[Settings]) -> set[str]:
+    """Return the names of the settings of a kind."""
     return {field.name for field in dataclasses.fields(kind)}
-
-
-def common_parameters(row: Estimator[Any] | None = None) -> list[click.Parameter]:
-    """Return the common options of training for a command line; the help shows what either preset gives.
-
-    Args:
-        row: the estimator whose values the paper's preset gives, where it is known.
-    """
-    paper = row.paper_recipe if row is not None else Estimator.paper_recipe
-    shown = _shown(Recipe(), paper)
-    order = {name: index for index, name in enumerate(("algo", "shards", "out", "seed"))}
-    found = parameters(TrainSettings, shown)
-    return sorted(found, key=lambda one: order.get(one.name or "", len(order)))
-
-
-def own_parameters(row: Estimator[Any]) -> list[click.Parameter]:
-    """Return the options of an estimator for a command line.
-
-    Raises:
-        UserError: one has the name of a common option.
-    """
-    taken = _names(row.settings) & _names(TrainSettings)
-    if taken:
-        raise UserError(f"--algo: {row.settings.__name__}.{min(taken)} is the name of a common option; give it another")
-    return parameters(row.settings, _shown(row.settings(), row.paper))
-
-
-def network_parameters(network: str) -> list[click.Parameter]:
-    """Return the options of networks for a command line."""
-    kind = network_named(network).settings
-    return parameters(kind, _shown(kind(), kind()))
-
-
-def _shown(default: Settings, paper: Settings) -> dict[str, str]:
-    """Return what the help says of the default of each option."""
-    texts = {}
-    for field in dataclasses.fields(default):
-        ours, theirs = (shown_value(field, getattr(settings, field.name)) for settings in (default, paper))
-        texts[field.name] = f"default: {ours}" if ours == theirs else f"default: {ours}; paper: {theirs}"
-    return texts
