@@ -1,10 +1,7 @@
-"""All benchmarks, one after the other: `results/bench.json` and the table of ratios in `RESULTS.md`.
+"""All benchmarks, one after the other (`make bench`): `results/bench.json` and the table of ratios in `RESULTS.md`.
 
-    make bench
-
-Each part is a script of this folder, run in a process of its own. What a part measured is kept in `--work`: the same
-command goes on where it was stopped, and `--again PART` measures one anew. Parts that are not asked for stay as they
-were published. Nothing else should run meanwhile; it takes about two hours on 2 cores.
+Each part is a script of this folder, run in a process of its own; docs/benchmarks.md says what each compares. What a
+part measured is kept in `--work`. Nothing else should run meanwhile; it takes about two hours on 2 cores.
 """
 
 import importlib

@@ -1,10 +1,6 @@
 """Collection: grasps a second and core against the PyBullet wheel's Kuka environment, and where the time goes.
 
-    python benchmarks/collection.py
-
-Ours is what `grasp-datagen` runs in a worker, block by block, and the writing of their shard. The rival is
-`KukaDiverseObjectEnv` (see `kuka.py`), which keeps its frames in memory. Both follow the random policy: uniform
-actions, with probability 0.9 straight down. They take turns, each turn in a process of its own.
+python benchmarks/collection.py
 """
 
 import contextlib

@@ -2,9 +2,7 @@
 
     python benchmarks/decision.py
 
-The rivals search by the same noise and must give the same Q (to 1e-4). Weights are fresh, for time does not depend on
-them, but scaled: as they are, all candidates have nearly the same Q, and rivals would agree whatever they computed.
-A further table says what the Q of N candidates costs. Dimension key: B states, N candidates, A action.
+Dimension key: B states, N candidates, A action.
 """
 
 import statistics

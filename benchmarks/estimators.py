@@ -1,9 +1,6 @@
 """Training speed of every estimator against `mc`: real transitions a second, padding not counted.
 
-    python benchmarks/estimators.py --shards data/regular-10k
-
-All take turns in one process, on batches of the same data that lie ready in memory: what is timed is augmentation,
-targets, forward, backward and optimiser, as `grasp-train` runs them with default options.
+python benchmarks/estimators.py --shards data/regular-10k
 """
 
 import contextlib

@@ -1,12 +1,6 @@
 """Evaluation: episodes a second of `grasp-eval` against other ways to ask the network, one environment at a time.
 
-    python benchmarks/evaluation_speed.py runs/mc-regular-10k-seed0
-
-The rivals play the same episodes with the same noise in as many processes, and search by the whole network on 64 tiled
-copies of the picture in every iteration of CEM, by the trunk anew in every iteration, and by the trunk once, as ours
-does. They must first give the same actions and Q. Ours starts its workers within the clock, as `grasp-eval` does; the
-rivals' clocks start when their simulator is open and a first episode is played. `--rival-episodes` lets the slow ones
-stop after the first of them.
+python benchmarks/evaluation_speed.py runs/mc-regular-10k-seed0
 """
 
 import statistics

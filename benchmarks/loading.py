@@ -2,11 +2,7 @@
 
     python benchmarks/loading.py --shards data/regular-10k
 
-What is timed is a whole epoch from the making of the loader on, worker processes included; pages are in the system's
-cache for all. Ours runs in one process with a thread that gathers batches and threads that read blocks. "Streaming"
-reads every block from disk in every epoch, through a buffer of a tenth of the data, as with data larger than memory;
-a small dataset is named as often as it takes for a tenth to hold the 64 blocks that the sampler mixes. Every sample of
-a rival's first batch is looked up in the data. Rivals need Hugging Face `datasets`; without it only PNG files are read.
+Without Hugging Face `datasets` only PNG files are read.
 """
 
 import contextlib

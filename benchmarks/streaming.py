@@ -1,9 +1,6 @@
 """What streaming from disk costs training: waiting for batches, and memory that grows.
 
-    python benchmarks/streaming.py --shards data/regular-10k
-
-"Streaming" is reading through a buffer that holds a tenth of the data, as with data larger than memory. The rival is
-the same training on batches that lie ready. Memory is watched in a process of its own.
+python benchmarks/streaming.py --shards data/regular-10k
 """
 
 import itertools

@@ -2,12 +2,7 @@
 
     python benchmarks/time_to_quality.py --shards data/regular-10k --work runs/time-to-quality
 
-Each training is a real session on the same blocks; "well enough" is the first validation whose ROC AUC of last steps is
-at least `--auc`, with the weights that a policy would use. The clock runs while batches are waited for and trained on,
-and stops for validation and checkpoints. All validate by one rule: every `--every` transitions, later whenever training
-has seen 2 % more. Ours is timed inside the run that the defaults give, 3,000 steps on a cosine: whoever trains does not
-know beforehand how soon a mark will be met. `--preset paper` stops at `--limit` times our time and is then shown as
-"at least". Every training that is over is kept in `--work`: the same command goes on with the others.
+Every training that is over is kept in `--work`: the same command goes on with the others.
 """
 
 import json

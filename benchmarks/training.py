@@ -1,13 +1,6 @@
 """Training speed of `mc` and `dql` against the same network written plainly in PyTorch, and of `ddpg` against d3rlpy's.
 
-    python benchmarks/training.py --shards data/regular-10k
-
-Ours and its rival take turns in one process, on batches of the same data that lie ready. Ours is `Session.update` with
-default options: augmentation, target, forward, backward, optimiser, averaged weights. The plain rival does all of that
-too, in float32; at each start its pictures must equal ours, and its Q and target to 1e-4. It profits from the allocator
-settings of our session. Its `dql` computes the picture's part of Q once for all 16 candidates, as ours does; a second
-one, with 16 copies of each picture, stands beside it. d3rlpy's DDPG learns from the same pictures with its own default
-network and settings, without augmentation: another and smaller job than ours; left out where it is not installed.
+python benchmarks/training.py --shards data/regular-10k
 """
 
 import contextlib

@@ -1,8 +1,6 @@
 """How much the memory of a collecting worker grows in its life: the native code of the simulator leaks.
 
-    python benchmarks/worker_memory.py --scenes 10000
-
-A bin is loaded for each grasp here and for each 20 in a collection: leaks come with loading.
+python benchmarks/worker_memory.py --scenes 10000
 """
 
 import dataclasses
