@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from graspq.benchmarks.kuka import Tally, kuka_grasps
-from graspq.benchmarks.measuring import BenchmarkSettings, Call, Ratio, Result, Row, apart, command, median_ratio
+from graspq.benchmarks.measuring import Call, Ratio, Result, Row, TurnsSettings, apart, command, median_ratio
 from graspq.benchmarks.stopwatch import PYTHON, Stopwatch
 from graspq.common.options import setting
 from graspq.datagen.collect import Block, Collection, collected
@@ -34,7 +34,7 @@ BLOCK = CollectionSettings().block_size
 
 
 @dataclass(frozen=True)
-class CollectionBenchmarkSettings(BenchmarkSettings):
+class CollectionBenchmarkSettings(TurnsSettings):
     """Settings of this benchmark."""
 
     turns: int = setting(7, help="Turns that are measured.", minimum=1)

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from graspq.benchmarks.measuring import (
-    BenchmarkSettings,
     Ratio,
     Result,
     Row,
+    TurnsSettings,
     command,
     greatest_difference,
     median_ratio,
@@ -40,7 +40,7 @@ ACTOR = "actor network"
 
 
 @dataclass(frozen=True)
-class DecisionSettings(BenchmarkSettings):
+class DecisionSettings(TurnsSettings):
     """Settings of this benchmark."""
 
     turns: int = setting(7, help="Turns that are measured, after one that is not.", minimum=1)

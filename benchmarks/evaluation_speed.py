@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from graspq.benchmarks.measuring import (
-    BenchmarkSettings,
     Call,
     Ratio,
     Result,
+    TurnsSettings,
     apart,
     command,
     greatest_difference,
@@ -37,7 +37,7 @@ Successes = dict[int, bool]
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationSettings(BenchmarkSettings):
+class EvaluationSettings(TurnsSettings):
     """Settings of this benchmark."""
 
     run: Path = setting(help="Run folder whose policy searches.", positional=True, metavar="RUN")

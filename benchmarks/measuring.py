@@ -6,6 +6,7 @@ A machine that others share slows all rivals of a turn alike; the median of the 
 import contextlib
 import datetime
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,12 +31,18 @@ Row = dict[str, Any]
 class BenchmarkSettings(Settings):
     """What every benchmark's command takes."""
 
-    turns: int = setting(5, help="Turns that are measured, after one that is not.", minimum=1)
     out: Path | None = setting(None, help="JSON file for the figures.")
 
 
 @dataclass(frozen=True)
-class TrainingSpeedSettings(BenchmarkSettings):
+class TurnsSettings(BenchmarkSettings):
+    """What benchmarks take whose rivals take turns."""
+
+    turns: int = setting(5, help="Turns that are measured.", minimum=1)
+
+
+@dataclass(frozen=True)
+class TrainingSpeedSettings(TurnsSettings):
     """What the benchmarks of training and loading take."""
 
     shards: tuple[str, ...] = setting(("data/regular-10k",), help="Dataset folders, shard files or globs.")
@@ -114,9 +121,10 @@ class Result:
 
 
 def command(kind: type[B], measure: Callable[[B], Result]) -> click.Command:
-    """Return a benchmark's command: it measures, prints the result and writes it; its help is that of `measure`."""
+    """Return a benchmark's command, which measures, prints the result and writes it; the module's head is its help."""
+    head = str(sys.modules[measure.__module__].__doc__).partition("\n\n")[0]
 
-    @click.command(cls=Command, help=measure.__doc__)
+    @click.command(cls=Command, help=head)
     @options_from(kind)
     def main(settings: B) -> None:
         measure(settings).publish(settings)

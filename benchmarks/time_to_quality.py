@@ -14,7 +14,7 @@ from pathlib import Path
 
 import click
 
-from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command
+from graspq.benchmarks.measuring import BenchmarkSettings, Ratio, Result, command
 from graspq.benchmarks.sessions import batches_of
 from graspq.common.errors import UserError
 from graspq.common.options import setting
@@ -28,9 +28,11 @@ GROWTH = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
-class QualitySettings(TrainingSpeedSettings):
+class QualitySettings(BenchmarkSettings):
     """Settings of this benchmark."""
 
+    shards: tuple[str, ...] = setting(("data/regular-10k",), help="Dataset folders, shard files or globs.")
+    threads: int | None = setting(None, help="CPU threads; torch's own choice if not given.", minimum=1)
     work: Path = setting(help="Folder for the times.")
     auc: float = setting(0.75, help="The bar: ROC AUC.", minimum=0.5, maximum=1)
     seeds: int = setting(1, help="Trainings of each; seeds from 0.", minimum=1)

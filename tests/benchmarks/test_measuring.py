@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from graspq.benchmarks.measuring import (
-    BenchmarkSettings,
     Call,
     Ratio,
     Result,
+    TurnsSettings,
     apart,
     command,
     greatest_difference,
@@ -74,7 +74,7 @@ def test_memory_is_that_of_this_process() -> None:
 
 def test_a_command_prints_and_writes_what_it_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = Result([Ratio("x", 2.0)], {"Rows": [{"name": "a", "number": 0.12345}]}, {"threads": 2})
-    main = command(BenchmarkSettings, lambda settings: result)
+    main = command(TurnsSettings, lambda settings: result)
     with pytest.raises(SystemExit) as ended:
         main.main(["--out", str(tmp_path / "out.json")])
     assert ended.value.code == 0
