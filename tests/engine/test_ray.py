@@ -12,6 +12,9 @@ from graspq.common.errors import UserError
 from graspq.datagen.collect import Block, Collection, collected
 from graspq.datagen.settings import CollectionSettings
 from graspq.engine import EngineSettings, run
+from graspq.evaluate.rollout import Rollouts, run_rollouts
+from graspq.evaluate.scenes import Scenes
+from graspq.policies.random import RandomPolicy
 from graspq.sim.task import TASKS
 
 pytest.importorskip("ray")
@@ -83,6 +86,24 @@ def test_a_collection_whose_node_is_killed_in_the_middle_gives_the_bytes_of_the_
     assert {block: contents(episodes) for block, episodes in found.items()} == {
         block: contents(episodes) for block, episodes in expected.items()
     }
+
+
+def test_an_evaluation_whose_node_is_killed_in_the_middle_gives_the_rows_of_the_local_engine(
+    cluster, on_cluster, regular_objects
+):
+    cluster.add_node(num_cpus=1)
+    work = Rollouts(Scenes(TASKS["regular"], regular_objects.folder, "test", 0), RandomPolicy())
+    seen = []
+
+    def kill_one(row):
+        seen.append(row)
+        if len(seen) == 4:
+            cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+
+    rows, films = run_rollouts(work, 16, on_cluster, films=2, on_row=kill_one)
+    expected, expected_films = run_rollouts(work, 16, EngineSettings(workers=0), films=2)
+    assert rows == expected and len(seen) == 16
+    assert [film.frames.tobytes() for film in films] == [film.frames.tobytes() for film in expected_films]
 
 
 def contents(episodes):
