@@ -77,7 +77,7 @@ def conservative_update(
     return {name: value.detach() for name, value in metrics.items()}
 
 
-conservative = Estimator(
+conservative: Estimator[ConservativeSettings] = Estimator(
     summary="Double Q-learning with a penalty on Q of random actions",
     settings=ConservativeSettings,
     target_value=TargetValue("bootstrapped (double Q), conservative", dql.target, needs_next=True),
