@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from graspq.common.options import Settings, setting
+from graspq.common.text import markdown
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.networks import Parts, q_network
@@ -193,6 +194,5 @@ def loss_of(row: Estimator[S], batch: Batch, target: Tensor, networks: Networks,
 
 def as_markdown(rows: Mapping[str, Estimator[Any]]) -> str:
     """Return the table of estimators in Markdown, as the README shows it."""
-    lines = ["| `--algo` | target value | action selection |", "|---|---|---|"]
-    lines += [f"| `{name}` | {row.target_value.words} | {row.action_selection.words} |" for name, row in rows.items()]
-    return "\n".join(lines) + "\n"
+    cells = ((f"`{name}`", row.target_value.words, row.action_selection.words) for name, row in rows.items())
+    return markdown(("`--algo`", "target value", "action selection"), cells)
