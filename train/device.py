@@ -3,11 +3,13 @@
 import contextlib
 import ctypes
 import dataclasses
+import os
 from typing import Literal
 
 import torch
 
 from graspq.common.errors import UserError
+from graspq.common.files import cache_folder
 
 
 def chosen_device(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
@@ -60,6 +62,8 @@ def prepare(threads: int | None) -> None:
     if threads is not None:
         torch.set_num_threads(threads)
     torch.backends.cudnn.deterministic = True
+    # An optimiser makes this folder, though nothing is compiled: not among the temporary files, where it would stay.
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder("torchinductor")))
     trim_threshold, top_pad, mmap_threshold = -1, -2, -3
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
