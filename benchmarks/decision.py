@@ -29,7 +29,8 @@ from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.train.networks import build, q_network, state_network
 from graspq.train.networks.network import NetworkSpecification, QNetwork
-from graspq.train.selection import CemSettings, Choice, cross_entropy_method, pointed, single_steps, uniform_actions
+from graspq.train.search_settings import CemSettings
+from graspq.train.selection import Choice, cross_entropy_method, pointed, single_steps, uniform_actions
 from graspq.train.state import seeded
 
 LEAST_DEVIATION = 0.01

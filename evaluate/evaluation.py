@@ -38,7 +38,7 @@ from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
 from graspq.policies.named import ScoredPolicy, policy_named
 from graspq.sim.task import Task, task_from_json, task_named
-from graspq.train.selection import CemSettings
+from graspq.train.search_settings import CemSettings
 
 if TYPE_CHECKING:
     from graspq.policies.of_run import RunPolicy

@@ -14,7 +14,7 @@ from typing import Any
 from graspq.common.errors import UserError
 from graspq.evaluate.records import ORACLE, RANDOM
 from graspq.evaluate.settings import EvalSettings
-from graspq.train.selection import CemSettings
+from graspq.train.search_settings import CemSettings
 
 LISTS = ("runs", "policies", "tasks", "splits", "objects", "seeds")
 SINGLES = ("episodes", "checkpoint", "cem")

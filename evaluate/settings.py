@@ -6,7 +6,7 @@ from typing import Literal
 
 from graspq.common.options import parse_count, setting
 from graspq.engine import EngineSettings
-from graspq.train.selection import Answer, CemSettings, StepMode
+from graspq.train.search_settings import Answer, CemSettings, StepMode
 
 Device = Literal["auto", "cpu", "cuda"]
 

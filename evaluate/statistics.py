@@ -6,6 +6,7 @@ Every rate that graspq publishes stands with one of these intervals, 95 % unless
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
@@ -29,10 +30,15 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
     Raises:
         ValueError: `trials` is below 1, or `successes` is not within 0 .. trials.
 
-    Source: Wilson 1927, as computed by `scipy.stats.binomtest`.
+    Source: Wilson 1927.
     """
-    interval = scipy.stats.binomtest(successes, trials).proportion_ci(confidence_level=confidence, method="wilson")
-    return float(interval.low), float(interval.high)
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"expected 0 .. trials successes of at least one trial, got {successes} of {trials}")
+    z2 = NormalDist().inv_cdf((1 + confidence) / 2) ** 2
+    rate = successes / trials
+    half = math.sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2)))
+    low, high = ((rate + z2 / (2 * trials) + side * half) / (1 + z2 / trials) for side in (-1, 1))
+    return 0.0 if successes == 0 else low, 1.0 if successes == trials else high
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,7 @@ def paired_difference(
     count = int(one.size)
     b, c = int(np.sum(one & ~two)), int(np.sum(~one & two))
     p1, p2 = (b + 1) / (count + 2), (c + 1) / (count + 2)
-    half = _normal_quantile(confidence) * math.sqrt((p1 + p2 - (p1 - p2) ** 2) / (count + 2))
+    half = NormalDist().inv_cdf(0.5 + confidence / 2) * math.sqrt((p1 + p2 - (p1 - p2) ** 2) / (count + 2))
     p_value = float(scipy.stats.binomtest(b, b + c, 0.5).pvalue) if b + c > 0 else 1.0
     low, high = max(-1.0, p1 - p2 - half), min(1.0, p1 - p2 + half)
     return PairedDifference((b - c) / count, low, high, b, c, count, p_value)
@@ -125,7 +131,3 @@ def mean_over_seeds(values: Sequence[float], confidence: float = CONFIDENCE) -> 
     deviation = float(np.std(values, ddof=1))
     half = float(scipy.stats.t.ppf(0.5 + confidence / 2, len(values) - 1)) * deviation / math.sqrt(len(values))
     return MeanOverSeeds(mean, mean - half, mean + half, deviation, len(values))
-
-
-def _normal_quantile(confidence: float) -> float:
-    return float(scipy.stats.norm.ppf(0.5 + confidence / 2))

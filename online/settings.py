@@ -7,7 +7,7 @@ from typing import Any
 from graspq.common.options import parse_count, setting
 from graspq.engine import EngineSettings
 from graspq.engine.settings import ENGINE_OPTIONS
-from graspq.train.selection import Answer, CemSettings
+from graspq.train.search_settings import Answer, CemSettings
 
 # They may differ when a run is resumed: they do not decide what is collected.
 FREE_SETTINGS = ENGINE_OPTIONS | {"start", "checkpoint", "objects"}

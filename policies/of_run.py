@@ -17,7 +17,8 @@ from graspq.common.errors import UserError
 from graspq.sim.observation import Observation
 from graspq.sim.task import task_from_json
 from graspq.train.networks.network import NetworkSpecification
-from graspq.train.selection import Acting, ActionSelection, CemSettings, StochasticSearch
+from graspq.train.search_settings import CemSettings
+from graspq.train.selection import Acting, ActionSelection, StochasticSearch
 
 Device = Literal["auto", "cpu", "cuda"]
 

@@ -12,7 +12,7 @@ from graspq.common.files import read_json, write_json
 from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
 from graspq.studies.plan import Job, Plan
 from graspq.train.run import Run, step_of
-from graspq.train.selection import CemSettings
+from graspq.train.search_settings import CemSettings
 
 Status = Literal["done", "failed", "to do"]
 SCENES_SEED = 0

@@ -6,21 +6,18 @@ choice does not depend on which other states share its batch. Dimensions: B batc
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar, Literal, NamedTuple, Protocol, cast
+from typing import ClassVar, NamedTuple, Protocol, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from graspq.common.action_space import ActionSpace
-from graspq.common.errors import UserError
-from graspq.common.options import Settings, setting
 from graspq.train.networks.network import QNetwork
+from graspq.train.search_settings import Answer, CemSettings, StepMode
 
 QOfActions = Callable[[Tensor], Tensor]
 """Q of candidate actions, [B, N, A] -> [B, N], for B states that are fixed inside it."""
-Answer = Literal["mean", "best"]
-StepMode = Literal["scale", "clip"]
 # How far outside the box an actor may point.
 FARTHEST_POINT = 1.25
 
@@ -169,32 +166,6 @@ def one_step_of(displacement: Tensor, mode: StepMode) -> Tensor:
     if mode == "clip":
         return displacement.clamp(-1, 1)
     return displacement / displacement.abs().amax(-1, keepdim=True).clamp(min=1)
-
-
-@dataclasses.dataclass(frozen=True)
-class CemSettings(Settings):
-    """The search by which a Q-function acts; see `cross_entropy_method`.
-
-    Source: Quillen et al. 2018 (3 iterations of 64 samples).
-    """
-
-    iterations: int = setting(3, help="Iterations of CEM.", minimum=1, maximum=100)
-    samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
-    elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
-    answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
-    synthetic_step: StepMode = setting(
-        "scale", help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them."
-    )
-
-    def __post_init__(self) -> None:
-        """Check the ranges, and that there are no more elites than samples.
-
-        Raises:
-            UserError: one of them does not hold.
-        """
-        super().__post_init__()
-        if self.elites > self.samples:
-            raise UserError(f"CEM elites: expected at most as many as samples ({self.samples}), got {self.elites}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 from graspq.common.errors import UserError
 from graspq.evaluate.jobs import jobs_from_settings
 from graspq.evaluate.settings import EvalSettings
-from graspq.train.selection import CemSettings
+from graspq.train.search_settings import CemSettings
 
 
 def make_run(folder: Path) -> Path:

@@ -24,7 +24,7 @@ from graspq.policies.of_run import load
 from graspq.train import loop
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.run import Run
-from graspq.train.selection import CemSettings
+from graspq.train.search_settings import CemSettings
 
 Make = Callable[..., Plan]
 

@@ -14,7 +14,8 @@ from graspq.policies.of_run import RunPolicy, load
 from graspq.sim.observation import Observation
 from graspq.sim.task import TASKS
 from graspq.train.networks.network import QNetwork, StateNetwork
-from graspq.train.selection import CemSettings, pointed
+from graspq.train.search_settings import CemSettings
+from graspq.train.selection import pointed
 
 FIVE_LINES = """
 import numpy as np

@@ -13,7 +13,7 @@ from graspq.objects.object_set import ObjectSet
 from graspq.studies.plan import Job, Plan
 from graspq.studies.state import run_folder
 from graspq.train.run import Run, checkpoint_name
-from graspq.train.selection import CemSettings
+from graspq.train.search_settings import CemSettings
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

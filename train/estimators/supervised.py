@@ -13,7 +13,8 @@ from torch import Tensor
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, RegressionSettings, TargetValue
-from graspq.train.selection import Acting, CemSettings, SearchSpace, StochasticSearch, one_step_of
+from graspq.train.search_settings import CemSettings
+from graspq.train.selection import Acting, SearchSpace, StochasticSearch, one_step_of
 from graspq.train.state import Networks
 from graspq.train.targets import episode_value
 

@@ -1,0 +1,36 @@
+"""Settings of the search by which a Q-function acts; apart from `selection`, so that commands start without PyTorch."""
+
+import dataclasses
+from typing import Literal
+
+from graspq.common.errors import UserError
+from graspq.common.options import Settings, setting
+
+Answer = Literal["mean", "best"]
+StepMode = Literal["scale", "clip"]
+
+
+@dataclasses.dataclass(frozen=True)
+class CemSettings(Settings):
+    """The search by which a Q-function acts; see `selection.cross_entropy_method`.
+
+    Source: Quillen et al. 2018 (3 iterations of 64 samples).
+    """
+
+    iterations: int = setting(3, help="Iterations of CEM.", minimum=1, maximum=100)
+    samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
+    elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
+    answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
+    synthetic_step: StepMode = setting(
+        "scale", help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them."
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges, and that there are no more elites than samples.
+
+        Raises:
+            UserError: one of them does not hold.
+        """
+        super().__post_init__()
+        if self.elites > self.samples:
+            raise UserError(f"CEM elites: expected at most as many as samples ({self.samples}), got {self.elites}")
