@@ -41,8 +41,8 @@ data: setup ## collect SIZE=10k|100k|1M grasps [TASK=regular|targeted] [WORKERS=
 
 quickstart: setup ## the whole job, small: objects, 2,000 grasps, mc and dql, scored, a report (at most 15 minutes)
 	$(BIN)/grasp-datagen --size 2000 --out data/quickstart
-	$(BIN)/grasp-train --algo mc --shards data/quickstart --steps $(QUICK_STEPS) --validate-every 100 --out $(QUICK)/mc
-	$(BIN)/grasp-train --algo dql --shards data/quickstart --steps $(QUICK_STEPS) --validate-every 100 --out $(QUICK)/dql
+	$(BIN)/grasp-train --algo mc --shards data/quickstart --steps $(QUICK_STEPS) --save-every 100 --out $(QUICK)/mc
+	$(BIN)/grasp-train --algo dql --shards data/quickstart --steps $(QUICK_STEPS) --save-every 100 --out $(QUICK)/dql
 	$(BIN)/grasp-eval $(QUICK)/mc $(QUICK)/dql --policy random --episodes 200 --out $(QUICK)/evaluations
 	$(BIN)/grasp-report $(QUICK) --out $(QUICK)/report.html
 	@echo "open $(QUICK)/report.html"

@@ -1,6 +1,7 @@
 """The rules of the house, read from the source: imports, packaging, names that others own."""
 
 import ast
+import dataclasses
 import re
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from graspq.common.options import flag, shown_value
 from graspq.train.estimator import as_markdown
 from graspq.train.estimators import ESTIMATORS
 
@@ -128,11 +130,42 @@ def test_the_readmes_table_of_estimators_is_the_code():
     assert readme[start : readme.index("<!-- end of estimators -->")] == as_markdown(ESTIMATORS)
 
 
-def test_files_that_the_readme_names_exist():
-    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text())
-    missing = [link for link in links if "://" not in link and not (ROOT / link).exists()]
-    assert len(links) > 5
-    assert missing == []
+@pytest.mark.parametrize(
+    "page", ["README.md", "RESULTS.md", *(f"docs/{one.name}" for one in (ROOT / "docs").glob("*.md"))]
+)
+def test_files_that_a_page_names_exist(page):
+    assert links_without_a_file(ROOT / page) == []
+
+
+def links_without_a_file(page):
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text())
+    return [link for link in links if "://" not in link and not (page.parent / link).exists()]
+
+
+def test_the_index_of_the_estimators_pages_holds_the_readmes_table():
+    lines = as_markdown(ESTIMATORS).splitlines()[2:]
+    index = (ROOT / "docs/estimators/README.md").read_text()
+    assert [line for line in lines if line not in index] == []
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_page_of_an_estimator_has_its_options_and_the_differences_that_its_code_lists(name):
+    row, page = ESTIMATORS[name], ROOT / f"docs/estimators/{name}.md"
+    text = page.read_text()
+    assert links_without_a_file(page) == []
+    values = [(field, row.settings(), row.paper) for field in dataclasses.fields(row.settings)]
+    wanted = [
+        f"| `{flag(field.name)}` | "
+        + " | ".join(shown_value(field, getattr(one, field.name)) for one in (default, paper))
+        for field, default, paper in values
+    ]
+    assert re.findall(r"^(\| `--[a-z-]+` \| [^|]+ \| [^|]+) \|", text, re.MULTILINE) == wanted
+    code = (ROOT / f"train/estimators/{name.replace('-', '_')}.py").read_text()
+    listed = [
+        int(one) for part in code.split("Differs:")[1:] for one in re.findall(r"\b(\d+)\. ", part.split('"""')[0])
+    ]
+    section = text[text.index("## Differences") : text.index("## Measurements")]
+    assert [int(one) for one in re.findall(r"^(\d+)\. ", section, re.MULTILINE)] == sorted(listed)
 
 
 def test_tests_mirror_the_folders():
