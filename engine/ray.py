@@ -90,14 +90,22 @@ def _cluster(address: str) -> Iterator[None]:
         ray.shutdown()
 
 
+# What sweeps up after us, when its standard input has ended with us. Ray's processes end soon then, but for agents that
+# try for a minute to tell the others; all of them write logs into the folder.
+_SWEEPER = """
+cat >/dev/null; sleep 1
+for process in /proc/[0-9]*; do ls -l "$process/fd" 2>/dev/null | grep -qF " $0/" && kill -9 "${process#/proc/}"; done
+sleep 0.5; rm -rf -- "$0"
+"""
+
+
 @contextlib.contextmanager
 def _removed_in_any_case() -> Iterator[Path]:
-    """Yield a temporary folder that goes when this process ends, even by SIGKILL."""
+    """Yield a temporary folder that goes when this process ends, even by SIGKILL, and with it what works in it."""
     place = Path(tempfile.gettempdir())
     folder = Path(tempfile.mkdtemp(prefix="graspq-ray-", dir=place if len(str(place)) < _SOCKET_ROOM - 20 else "/tmp"))
-    # Its standard input ends with us, and Ray's own processes soon after.
-    waiting = 'cat >/dev/null; sleep 2; rm -rf -- "$0"; sleep 1; rm -rf -- "$0"'
-    sweeper = subprocess.Popen(["sh", "-c", waiting, str(folder)], stdin=subprocess.PIPE, start_new_session=True)
+    words = ["sh", "-c", _SWEEPER, str(folder)]
+    sweeper = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
         yield folder
     finally:

@@ -1,5 +1,6 @@
 """A process that hands out work is ended, and what it leaves is looked for."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -12,10 +13,19 @@ def opened(notes):
     return {path.name.split("-")[1] for path in notes.glob("open-*")}
 
 
-def alive(notes):
-    """Return the workers that run; in a container nobody may fetch the status of one that has ended (Z)."""
-    states = [Path("/proc") / pid / "status" for pid in opened(notes)]
-    return [state for state in states if state.exists() and "State:\tZ" not in state.read_text()]
+def alive(mark):
+    """Return the processes that were started with this in their environment, or have a file open below a folder of it.
+
+    In a container nobody may fetch the status of one that has ended (Z).
+    """
+    found, folder = [], mark.partition("=")[2]
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            marked = mark.encode() in (process / "environ").read_bytes()
+            writes = any(folder in str(path.readlink()) for path in (process / "fd").iterdir())
+            if (marked or writes) and "State:\tZ" not in (process / "status").read_text():
+                found.append(process.name)
+    return found
 
 
 def end_in_the_middle(engine, number, folder):
@@ -23,9 +33,13 @@ def end_in_the_middle(engine, number, folder):
     notes, temporary = folder / "notes", folder / "t"
     notes.mkdir()
     temporary.mkdir()
+    mark = f"MARK={folder}"
     driver = [sys.executable, Path(__file__).with_name("driver.py"), engine, notes]
     with subprocess.Popen(
-        driver, env={**os.environ, "TMPDIR": str(temporary)}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        driver,
+        env={**os.environ, "TMPDIR": str(temporary), "MARK": str(folder)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     ) as parent:
         while len(list(notes.glob("unit-*"))) < 2:
             assert parent.poll() is None
@@ -33,7 +47,7 @@ def end_in_the_middle(engine, number, folder):
         parent.send_signal(number)
         parent.wait()
     until = time.monotonic() + 5
-    while (alive(notes) or list(temporary.iterdir())) and time.monotonic() < until:
+    while (alive(mark) or list(temporary.iterdir())) and time.monotonic() < until:
         time.sleep(0.05)
-    assert len(opened(notes)) == 2 and not alive(notes)
+    assert len(opened(notes)) == 2 and not alive(mark)
     assert not list(temporary.iterdir())
