@@ -9,8 +9,9 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from graspq.benchmarks.kuka import Tally, kuka_grasps
 from graspq.benchmarks.measuring import Call, Ratio, Result, Row, TurnsSettings, apart, command, median_ratio
@@ -29,6 +30,8 @@ from graspq.sim.bullet import bullet
 from graspq.sim.task import task_named
 
 TASK = task_named("regular")
+Engine = Literal["local", "ray"]
+_ON = {"local": "", "ray": ", on Ray"}
 OURS, RIVAL = "graspq", "KukaDiverseObjectEnv"
 BLOCK = CollectionSettings().block_size
 
@@ -42,6 +45,7 @@ class CollectionBenchmarkSettings(TurnsSettings):
     blocks: int = setting(3, help="Blocks of 20 grasps in a turn.", minimum=1)
     rival_grasps: int = setting(5, help="The rival's grasps in a turn.", minimum=1)
     workers: int = setting(2, help="Workers, against 1.", minimum=2)
+    engines: tuple[Engine, ...] = setting(("local", "ray"), help="Engines that they work in: local, ray.")
 
 
 @contextlib.contextmanager
@@ -161,38 +165,56 @@ def phases(objects: Path, seed: int, blocks: int) -> list[Row]:
     return sorted(rows, key=lambda row: -float(row["CPU ms"]))
 
 
-def seconds_a_grasp(objects: Path, seed: int, workers: int, blocks: int) -> float:
-    """Return seconds a grasp of so many workers, a shard of all blocks written.
+@dataclass(frozen=True)
+class Pace:
+    """Seconds until the first block of a collection is there, and seconds a grasp later on."""
 
-    The clock runs from the first block that each worker has done on average until `blocks` more of each are done: a
-    long collection's pace, without the start of processes.
+    first_block: float
+    grasp: float
+
+
+def pace_of(objects: Path, seed: int, engine: EngineSettings, blocks: int) -> Pace:
+    """Return the pace of an engine's workers, a shard of all blocks written.
+
+    The clock of the pace runs from the first block that each worker has done on average until `blocks` more of each are
+    done: a long collection's pace, without the start of processes.
     """
+    workers = engine.workers or 1
     # More blocks than are waited for: no worker is idle before the clock stops.
-    results = collected(
-        work(objects, seed), whole_blocks(range(workers * (blocks + 3))), EngineSettings(workers=workers)
-    )
+    results = collected(work(objects, seed), whole_blocks(range(workers * (blocks + 3))), engine)
     with shards_of(objects, seed) as add, contextlib.closing(results):
-        for _ in itertools.islice(results, workers):
+        start = time.perf_counter()
+        next(results)
+        first = time.perf_counter() - start
+        for _ in itertools.islice(results, workers - 1):
             pass
         start = time.perf_counter()
         done = [episodes for _, episodes in itertools.islice(results, workers * blocks)]
         for episodes in done:
             add(episodes)
-        return (time.perf_counter() - start) / (len(done) * BLOCK)
+        return Pace(first, (time.perf_counter() - start) / (len(done) * BLOCK))
 
 
 def measure(settings: CollectionBenchmarkSettings) -> Result:
     """Return pace against the rival, pace of several workers, and the phases of a grasp."""
     objects = default_object_set("regular").folder
     pace = paces(objects, settings)
-    teams = (1, settings.workers)
-    seconds: dict[int, list[float]] = {team: [] for team in teams}
+    counts = (1, settings.workers)
+    teams = [EngineSettings(engine=engine, workers=count) for engine in settings.engines for count in counts]
+    seen: dict[EngineSettings, list[Pace]] = {team: [] for team in teams}
     for turn, team in itertools.product(range(settings.turns), teams):
-        seconds[team].append(seconds_a_grasp(objects, settings.seed + turn, team, 2 * settings.blocks))
-    times = {team: median_ratio(seconds[1], values) for team, values in seconds.items()}
+        seen[team].append(pace_of(objects, settings.seed + turn, team, 2 * settings.blocks))
+    seconds = {team: [pace.grasp for pace in paces] for team, paces in seen.items()}
+    times = {team: median_ratio(seconds[replace(team, workers=1)], values) for team, values in seconds.items()}
     scaling = [
-        {"workers": team, "grasps a second": 1 / statistics.median(values), "times 1 worker": times[team]}
-        for team, values in seconds.items()
+        {
+            "engine": team.engine,
+            "workers": team.workers,
+            "seconds to the first block": statistics.median(pace.first_block for pace in seen[team]),
+            "grasps a second": 1 / statistics.median(seconds[team]),
+            "times 1 worker": times[team],
+        }
+        for team in teams
     ]
     (profile,) = apart([Call(phases, (objects, settings.seed, settings.blocks * settings.turns))])
     ours = pace[0]
@@ -202,7 +224,11 @@ def measure(settings: CollectionBenchmarkSettings) -> Result:
             Ratio(says, ours["times (grasps)"], bar=25, aim=50),
             Ratio("… a simulated action (a grasp of ours has fewer of them)", ours["times (actions)"]),
             Ratio("… a rendered frame", ours["times (frames)"]),
-            Ratio(f"collection, {settings.workers} workers against 1", times[settings.workers], bar=1.8, aim=1.95),
+            *(
+                Ratio(f"collection, {team.workers} workers against 1{_ON[team.engine]}", times[team], bar=1.8, aim=1.95)
+                for team in teams
+                if team.workers != 1
+            ),
         ],
         {
             "Collection, one process each": pace,

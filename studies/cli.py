@@ -1,6 +1,6 @@
 """`grasp-sweep`: trains and scores every point of a grid, some at a time, and writes one table.
 
-The way on: `grid` (what is tried) -> `plan` (the jobs) -> `running` (units of the engine) -> `state` -> `table`.
+The way on: `grid` (what is tried) -> `plan` (the jobs) -> `execution` (units of the engine) -> `state` -> `table`.
 """
 
 import contextlib
@@ -81,8 +81,8 @@ def plan_text(folder: Path, plan: Plan) -> str:
 
 def _run(settings: SweepSettings, folder: Path, plan: Plan, asked: Plan) -> int:
     from graspq.studies.commands import Means, check_commands, check_data
+    from graspq.studies.execution import Ending, Failure, Jobs, Task, forget_failures
     from graspq.studies.plan import write_plan
-    from graspq.studies.running import Ending, Failure, Jobs, Task, forget_failures
     from graspq.studies.state import state_of
     from graspq.studies.table import as_markdown, line_of, write_tables
 

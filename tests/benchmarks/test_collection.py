@@ -2,8 +2,9 @@
 
 import pytest
 
-from graspq.benchmarks.collection import BLOCK, our_grasps, phases, seconds_a_grasp
+from graspq.benchmarks.collection import BLOCK, our_grasps, pace_of, phases
 from graspq.benchmarks.measuring import Call, apart
+from graspq.engine import EngineSettings
 from graspq.objects.object_set import ObjectSet
 
 
@@ -23,4 +24,5 @@ def test_the_phases_of_a_grasp_make_a_whole_and_the_longest_stands_first(regular
 
 
 def test_the_pace_of_workers_is_that_of_whole_blocks(regular_objects: ObjectSet) -> None:
-    assert 0 < seconds_a_grasp(regular_objects.folder, 0, 1, 1) < 5
+    pace = pace_of(regular_objects.folder, 0, EngineSettings(workers=1), 1)
+    assert 0 < pace.grasp < 5 and pace.grasp < pace.first_block

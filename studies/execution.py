@@ -29,10 +29,11 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 
 @dataclass(frozen=True)
 class Task:
-    """A job, and with Ray what its run folder holds so far, packed."""
+    """A job, and with Ray what its run folder holds so far, packed, and the step that it has come to."""
 
     job: Job
     run: bytes | None = None
+    steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Jobs:
         name = hashlib.sha256(str(self.folder).encode()).hexdigest()[:16]
         folder, job = cache_folder("sweeps", f"{name}-{task.job.id}"), task.job
         here = run_folder(folder, job)
-        if task.run is not None and not trained_steps(run_of(here)):
+        if task.run is not None and task.steps >= trained_steps(run_of(here)):
             with committed_folder(here, replace=True) as temporary:
                 unpack(task.run, temporary)
         failure = do_job(folder, self._moved(place), job, self.means)
@@ -142,7 +143,10 @@ class Jobs:
         """Yield the units of some jobs, each packed when a worker is free for it."""
         for job in jobs:
             here = run_folder(self.folder, job)
-            yield Task(job, packed(here) if self.travels and here.is_dir() else None)
+            if self.travels and here.is_dir():
+                yield Task(job, packed(here), trained_steps(run_of(here)))
+            else:
+                yield Task(job)
 
 
 def _name_shards(run: Path, shards: Sequence[str]) -> None:
