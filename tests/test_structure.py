@@ -170,6 +170,6 @@ def test_the_page_of_an_estimator_has_its_options_and_the_differences_that_its_c
 
 def test_tests_mirror_the_folders():
     for folder in MAY_IMPORT:
-        modules = {path.stem for path in sources(folder)}
+        modules = {name for path in sources(folder) for name in (path.stem, path.parent.name)}
         for test in (ROOT / "tests" / folder).glob("test_*.py"):
             assert test.stem.removeprefix("test_") in modules | {"mirror", "learning"}, test
