@@ -202,7 +202,7 @@ def options_from(settings_type: type[Settings]) -> Callable[[Callable[..., Any]]
 
 
 def parameters(settings_type: type[Settings], defaults: Mapping[str, str] | None = None) -> list[click.Parameter]:
-    """Return the options of `settings_type`, in its order; a field without help is none.
+    """Return the options of `settings_type`, its own before those it inherits; a field without help is none.
 
     Args:
         settings_type: the settings.
@@ -210,10 +210,10 @@ def parameters(settings_type: type[Settings], defaults: Mapping[str, str] | None
             whoever reads them must ask `given_options` which were given.
     """
     hints = typing.get_type_hints(settings_type)
-    shown = defaults or {}
+    shown, inherited = defaults or {}, lambda field: field.name not in settings_type.__annotations__
     return [
         _parameter(field, hints[field.name], shown.get(field.name))
-        for field in dataclasses.fields(settings_type)
+        for field in sorted(dataclasses.fields(settings_type), key=inherited)
         if field.metadata.get("help") is not None
     ]
 

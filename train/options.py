@@ -96,7 +96,8 @@ def common_parameters(row: Estimator[Any] | None = None) -> list[click.Parameter
     """
     paper = row.paper_recipe if row is not None else Estimator.paper_recipe
     shown = _shown(Recipe(), paper)
-    order = {name: index for index, name in enumerate(("algo", "shards", "out", "seed"))}
+    first = ("algo", "shards", "out", "seed", *(field.name for field in dataclasses.fields(Recipe)))
+    order = {name: index for index, name in enumerate(first)}
     found = parameters(TrainSettings, shown)
     return sorted(found, key=lambda one: order.get(one.name or "", len(order)))
 
