@@ -7,10 +7,12 @@ driver's kernels are deterministic on a GPU.
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import click
 import torch
 
 from graspq.common.errors import UserError
@@ -99,11 +101,17 @@ def session(
         settings=settings.network_own.to_json(),
     )
     lagged = hasattr(settings.own, "lag_steps")
+    discount = settings.own.chosen_discount(pool.discount)
+    if ranks.first and discount != pool.discount and not lagged:
+        stored = f"the data's are of discount {pool.discount:g}"
+        click.echo(f"{settings.algo}: returns are made from the rewards with discount {discount:g}; {stored}", err=True)
     state = new_state(specification, row.parts, settings, settings.seed, precision, lagged=lagged, ranks=ranks)
     config = {
         "command": "grasp-train",
         "settings": settings.to_json(),
         "precision": precision.name,
+        "discount": discount,
+        "mc_return": "as stored" if discount == pool.discount else f"made from the rewards with discount {discount:g}",
         "network": specification.to_json(),
         "dataset": _described(pool, training, held_back),
         "versions": versions("torch", "numpy", "pyarrow", "safetensors"),
@@ -205,6 +213,8 @@ class Session:
             self._check_weights()
             result = self.validate() if self.ranks.first else None
             if result is not None:
+                if not all(math.isfinite(value) for value in (result.loss, result.loss_last_step or 0.0)):
+                    self._diverged(step, "held-back loss is not finite")
                 progress.log_validation(step, result)
             self.save()
 

@@ -6,13 +6,12 @@ from typing import Any
 
 import click
 
-from graspq.common.errors import UserError
 from graspq.common.options import Command, Settings, parameters, shown_value
 from graspq.train.estimator import Estimator
 from graspq.train.estimators import ESTIMATORS, estimator_named
 from graspq.train.networks import network_named
 from graspq.train.recipe import PAPER, Recipe
-from graspq.train.settings import TrainSettings, names_of, unknown_option
+from graspq.train.settings import TrainSettings, refuse_taken_names, unknown_option
 
 # Common options that stand before `--preset`: what is trained, on what, where to.
 FIRST = 4
@@ -54,6 +53,7 @@ class TrainingCommand(Command):
         common = [*self.params, *found[:FIRST], PRESET, *found[FIRST:], self.get_help_option(ctx)]
         groups = [("Options", [one for one in common if one is not None])]
         if row is not None:
+            refuse_taken_names(row, network)
             groups += [(f"Options of --algo {algo}", own_parameters(row))]
             groups += [(f"Options of --network {network}", network_parameters(network))]
         return groups
@@ -103,14 +103,7 @@ def common_parameters(row: Estimator[Any] | None = None) -> list[click.Parameter
 
 
 def own_parameters(row: Estimator[Any]) -> list[click.Parameter]:
-    """Return the options of an estimator for a command line.
-
-    Raises:
-        UserError: one has the name of a common option.
-    """
-    taken = names_of(row.settings) & names_of(TrainSettings)
-    if taken:
-        raise UserError(f"--algo: {row.settings.__name__}.{min(taken)} is the name of a common option; give it another")
+    """Return the options of an estimator for a command line."""
     return parameters(row.settings, _shown(row.settings(), row.paper))
 
 

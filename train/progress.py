@@ -19,9 +19,9 @@ from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
 from graspq.train.validation import Validation
 
-# Of what an update measures: means of absolute values that returns, which lie in [0, 1], keep near it. Its square is
-# that of the loss: where Q is a probability it cannot leave its range, but the outputs behind it can.
-LARGEST = 10.0
+# Of what an update measures: means of absolute values that returns, which lie in [0, 1], keep near it, and the loss,
+# which goes with their square: where Q is a probability it cannot leave its range, but the outputs behind it can.
+BOUNDS = {"q": 10.0, "v": 10.0, "target": 10.0, "loss": 100.0}
 LOG_EVERY = 50
 
 
@@ -97,13 +97,12 @@ class Progress:
         return None
 
     def _diverged(self, measured: Metrics) -> tuple[int, str] | None:
-        for index, loss in enumerate(measured["loss"].tolist()):
-            if not math.isfinite(loss):
-                return self._first + index, "loss is not finite"
+        for index in range(len(measured["loss"])):
             for name, values in measured.items():
-                value = float(values[index])
-                if not abs(value) <= (LARGEST**2 if name == "loss" else LARGEST):
-                    what = name if name == "loss" else f"mean |{name}|"
+                value, what = float(values[index]), name if name == "loss" else f"mean |{name}|"
+                if not math.isfinite(value):
+                    return self._first + index, f"{what} is not finite"
+                if abs(value) > BOUNDS.get(name, math.inf):
                     return self._first + index, f"{what} is {value:.3g}, and returns lie in [0, 1]"
         return None
 

@@ -20,6 +20,8 @@ from graspq.train.recipe import Recipe
 
 Preset = Literal["default", "paper"]
 NESTED = ("own", "network_own")
+# Options of the command that are no settings.
+COMMAND_OPTIONS = frozenset({"preset", "help", "version"})
 # Settings that may differ when a run is resumed: they do not decide what is learned. Of shards the digest is compared.
 FREE = frozenset({"shards", "out", "save_every", "device", "precision", "resident", "threads"})
 
@@ -106,6 +108,7 @@ def complete(given: Mapping[str, Any], preset: Preset = "default") -> TrainSetti
     recipe = row.paper_recipe if preset == "paper" else Recipe()
     network = given.get("network", recipe.network)
     own, network_own = row.paper if preset == "paper" else row.settings(), network_named(network).settings()
+    refuse_taken_names(row, network)
     values: dict[str, Any] = {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)}
     return _changed(values | {"network": network}, {"own": own, "network_own": network_own}, given)
 
@@ -144,6 +147,22 @@ def unknown_option(option: str, algo: str, network: str) -> str:
     if not owners:
         return f"No such option: {option} (with --algo {algo} and --network {network})"
     return f"{option} belongs to {', '.join(owners)}; it is no option of --algo {algo} with --network {network}"
+
+
+def refuse_taken_names(row: Estimator[Any], network: str) -> None:
+    """Refuse an estimator or networks whose options have a name that another option has.
+
+    Raises:
+        UserError: they have.
+    """
+    common, of_network = names_of(TrainSettings) | COMMAND_OPTIONS, network_named(network).settings
+    for option, kind in (("--algo", row.settings), (f"--network {network}", of_network)):
+        for name in sorted(names_of(kind) & common):
+            raise UserError(f"{option}: {kind.__name__}.{name} is the name of a common option; give it another")
+    for name in sorted(names_of(row.settings) & names_of(of_network)):
+        raise UserError(
+            f"--algo: {row.settings.__name__}.{name} is the name of an option of --network {network}; give it another"
+        )
 
 
 def names_of(kind: type[Settings]) -> set[str]:

@@ -14,22 +14,23 @@ import numpy as np
 import pytest
 import torch
 
-from graspq.common.action_space import grasping
+from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.seeding import generator
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.writer import commit_shard, write_shard
-from graspq.train.settings import TrainSettings, preset_settings
+from graspq.train.settings import TrainSettings, complete
 
-# For `plain_context`, `tiny_mdp` and `tiny_training`, which hold no tests.
+# For `plain`, `tiny_mdp` and `tiny_training`, which hold no tests.
 sys.path.append(str(Path(__file__).parent))
 SIZE, BLOCK = 16, 10
+ACTION = grasping((0.06, 0.06, 0.06, 0.4))
 GREY = {"A": 60, "B": 190}
 
 
-def make_episode(index: int) -> Episode:
+def make_episode(index: int, parts: int = 4) -> Episode:
     rng = generator("tests/train/episode", index)
-    actions = rng.uniform(-1, 1, (2, 4)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (2, parts)).astype(np.float32)
     steps = 2 if actions[0, 0] > 0 else 1
     success = bool(actions[1, 0] > 0) if steps == 2 else bool(rng.random() < 0.25)
     images = np.empty((steps, SIZE, SIZE, 3), np.uint8)
@@ -37,7 +38,7 @@ def make_episode(index: int) -> Episode:
         images[step] = GREY[state] + rng.integers(-20, 20, (SIZE, SIZE, 3))
     rewards = np.zeros(steps, np.float32)
     rewards[-1] = success
-    poses = rng.normal(0.3, 0.2, (steps + 1, 4)).astype(np.float32)
+    poses = rng.normal(0.3, 0.2, (steps + 1, parts)).astype(np.float32)
     return Episode(
         episode_id=index,
         block=index // BLOCK,
@@ -57,18 +58,18 @@ def make_episode(index: int) -> Episode:
     )
 
 
-def make_dataset(folder: Path, blocks: int, discount: float = 1.0) -> Path:
+def make_dataset(folder: Path, blocks: int, discount: float = 1.0, action: ActionSpace = ACTION) -> Path:
     manifest = Manifest(
         task={"name": "two-states", "max_steps": 15},
         settings={"seed": 0, "block_size": BLOCK},
         versions={"graspq": "0"},
         object_set={"name": "drawn", "sha256": "0" * 64},
         image_shape=(SIZE, SIZE, 3),
-        action=grasping((0.06, 0.06, 0.06, 0.4)),
+        action=action,
         discount=discount,
-        phi_range=(-2.9, 2.9),
+        phi_range=(-2.9, 2.9) if action is ACTION else None,
     )
-    episodes = [make_episode(index) for index in range(blocks * BLOCK)]
+    episodes = [make_episode(index, action.size) for index in range(blocks * BLOCK)]
     commit_shard(folder, manifest, write_shard(folder, manifest, 0, blocks, episodes))
     return folder
 
@@ -104,10 +105,8 @@ def settings(dataset: Path, tmp_path: Path) -> Callable[..., TrainSettings]:
             "precision": "float32",
             "device": "cpu",
             "threads": 1,
-            "log_every": 5,
-            "checkpoint_every": 10,
-            "validate_every": 10,
+            "save_every": 10,
         }
-        return preset_settings(preset, **short | {"algo": algo} | given)
+        return complete(short | {"algo": algo} | given, preset)
 
     return make

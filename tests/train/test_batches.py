@@ -12,10 +12,10 @@ from torch import Tensor
 from graspq.common.errors import UserError
 from graspq.datasets.dataset import open_shards
 from graspq.train.batch import Batch
-from graspq.train.batches import batch_rows, is_resident, training_batches
-from graspq.train.distributed import ALONE, Ranks
+from graspq.train.batches import batch_rows, training_batches
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.loop import train
+from graspq.train.parallel import ALONE, Ranks
 from graspq.train.resident import ResidentPool, image_bytes
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
@@ -26,8 +26,7 @@ CPU = torch.device("cpu")
 
 def batches(settings: TrainSettings, count: int, start: int = 0, ranks: Ranks = ALONE) -> list[Batch]:
     pool = open_shards(settings.shards).with_discount(0.7)
-    estimator = ESTIMATORS[settings.algo]
-    with training_batches(pool, settings, estimator, CPU, start, ranks) as endless:
+    with training_batches(pool, settings, settings.row.target_value, CPU, start, ranks) as endless:
         return list(itertools.islice(endless, count))
 
 
@@ -45,49 +44,30 @@ def assert_same(first: Batch, second: Batch) -> None:
 @pytest.mark.parametrize("ranks", [ALONE, Ranks(1, 3)])
 def test_resident_batches_are_those_of_the_stream_bit_by_bit(settings: Make, algo: str, ranks: Ranks) -> None:
     # Beyond the end of an epoch.
-    streamed, resident = (batches(settings(algo, resident=resident), 40, 5, ranks) for resident in ("no", "yes"))
+    streamed, resident = (batches(settings(algo, resident=resident), 40, 5, ranks) for resident in (False, True))
     for first, second in zip(streamed, resident, strict=True):
         assert_same(first, second)
     assert (streamed[0].next_image is not None) == (algo == "dql")
 
 
 def test_a_resident_run_ends_in_the_same_bits_and_may_go_on_streamed(settings: Make, tmp_path: Path) -> None:
-    train(settings("corr-mc", out=tmp_path / "streamed", resident="no"))
-    train(settings("corr-mc", out=tmp_path / "both", resident="yes"), stop_at=10)
-    train(settings("corr-mc", out=tmp_path / "both", resident="no"))
+    train(settings("corr-mc", out=tmp_path / "streamed", resident=False))
+    train(settings("corr-mc", out=tmp_path / "both", resident=True), stop_at=10)
+    train(settings("corr-mc", out=tmp_path / "both", resident=False))
     first, second = (Run.open(tmp_path / name).checkpoint(20) for name in ("streamed", "both"))
     assert (first / "state.json").read_bytes() == (second / "state.json").read_bytes(), "digests of all tensors"
-
-
-def test_auto_streams_on_a_cpu_and_what_was_asked_for_is_done() -> None:
-    assert [is_resident(asked, CPU, 1) for asked in ("auto", "yes", "no")] == [False, True, False]
-
-
-def test_auto_keeps_images_on_a_gpu_where_they_take_three_fifths_of_its_free_memory_or_less(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    gpu, asked_of = torch.device("cuda", 1), []
-
-    def free_and_total(device: torch.device) -> tuple[int, int]:
-        asked_of.append(device)
-        return 1_000_000, 5_000_000
-
-    monkeypatch.setattr(torch.cuda, "mem_get_info", free_and_total)
-    assert [is_resident("auto", gpu, needed) for needed in (1, 600_000, 600_001)] == [True, True, False]
-    assert asked_of == [gpu] * 3
-    assert [is_resident(asked, gpu, 4_000_000) for asked in ("yes", "no")] == [True, False]
 
 
 def test_images_that_fit_nowhere_are_refused_in_one_line(dataset: Path) -> None:
     pool = open_shards([dataset])
     first = dataclasses.replace(pool.blocks[0], rows=2**52)
-    with pytest.raises(UserError, match="use --resident no"):
+    with pytest.raises(UserError, match=r"--resident: .* GiB of images do not fit on cpu; leave it out"):
         ResidentPool.read(dataclasses.replace(pool, blocks=(first, *pool.blocks[1:])), CPU)
 
 
 def test_a_batch_of_episodes_has_about_as_many_transitions(settings: Make, dataset: Path) -> None:
     pool = open_shards([dataset])
-    rows = batch_rows(pool, settings("corr-mc"), ESTIMATORS["corr-mc"])
+    rows = batch_rows(pool, settings("corr-mc"), ESTIMATORS["corr-mc"].target_value)
     assert abs(rows * pool.rows / pool.episodes - 32) < pool.rows / pool.episodes
-    assert batch_rows(pool, settings("mc"), ESTIMATORS["mc"]) == 32
+    assert batch_rows(pool, settings("mc"), ESTIMATORS["mc"].target_value) == 32
     assert image_bytes(pool) == pool.rows * 16 * 16 * 3

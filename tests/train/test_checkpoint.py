@@ -1,27 +1,35 @@
 """Checkpoints: what is saved comes back, and what is damaged or foreign is refused in one line."""
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
+from plain import FLOAT32
 
 from graspq.common.errors import UserError
 from graspq.train.checkpoint import load_acting, load_checkpoint, save_checkpoint
 from graspq.train.loop import train
-from graspq.train.networks import NetworkSpecification
+from graspq.train.networks.network import NetworkSpecification
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
-from graspq.train.state import new_state
+from graspq.train.state import TrainState, new_state
 
 Make = Callable[..., TrainSettings]
 
 
+def fresh_state(specification: NetworkSpecification, settings: TrainSettings) -> TrainState:
+    lagged = hasattr(settings.own, "lag_steps")
+    return new_state(specification, settings.row.parts, settings, settings.seed, FLOAT32, lagged=lagged)
+
+
 @pytest.fixture
 def run(settings: Make) -> Run:
-    return train(settings(steps=2))
+    return train(settings("dql", steps=2))
 
 
 def flip(path: Path, position: int) -> None:
@@ -31,18 +39,18 @@ def flip(path: Path, position: int) -> None:
 
 
 def test_a_checkpoint_restores_every_tensor_and_its_layout(settings: Make, run: Run) -> None:
-    chosen = settings(steps=2)
+    chosen = settings("dql", steps=2)
     specification = NetworkSpecification.from_json(run.config["network"])
-    state = new_state(specification, chosen, torch.device("cpu"), {"q": 1})
-    load_checkpoint(run.checkpoint(), state, specification)
+    state = fresh_state(specification, chosen)
+    load_checkpoint(run.checkpoint(), state)
     assert state.step == 2
-    fresh = new_state(specification, chosen, torch.device("cpu"), {"q": 1})
-    assert not torch.equal(state.learned["q"].last.weight, fresh.learned["q"].last.weight)  # type: ignore[arg-type]
-    again = save_checkpoint(run.folder / "again", state, specification)
+    fresh = fresh_state(specification, chosen)
+    assert not torch.equal(state.networks.online["q"].last.weight, fresh.networks.online["q"].last.weight)  # type: ignore[arg-type]
+    again = save_checkpoint(run.folder / "again", state)
     for path in run.checkpoint().iterdir():
         assert path.read_bytes() == (again / path.name).read_bytes(), path.name
     for (name, ours), theirs in zip(
-        state.learned["q"].named_parameters(), fresh.learned["q"].parameters(), strict=True
+        state.networks.online["q"].named_parameters(), fresh.networks.online["q"].parameters(), strict=True
     ):
         assert ours.stride() == theirs.stride(), name
         assert state.optimizers["q"].state[ours]["exp_avg"].stride() == ours.stride(), name
@@ -53,9 +61,7 @@ def test_a_policy_gets_the_averaged_network_in_evaluation_mode(run: Run) -> None
     network = loaded.networks["q"]
     averaged = (run.checkpoint() / "averaged-q.safetensors").read_bytes()
     assert not network.training and not any(parameter.requires_grad for parameter in network.parameters())
-    assert loaded.step == 2 and loaded.config["settings"]["algo"] == "mc"
-    import safetensors.torch
-
+    assert loaded.step == 2 and loaded.config["settings"]["algo"] == "dql"
     for name, tensor in safetensors.torch.load(averaged).items():
         assert torch.equal(network.state_dict()[name], tensor)
 
@@ -73,7 +79,7 @@ def test_a_policy_is_loaded_from_a_run_or_from_one_of_its_checkpoints(settings: 
         load_acting(run.folder, step=7)
 
 
-@pytest.mark.parametrize("name", ["averaged-q.safetensors", "extra.safetensors", "state.json"])
+@pytest.mark.parametrize("name", ["averaged-q.safetensors", "kept.safetensors", "state.json"])
 def test_a_single_flipped_bit_anywhere_is_noticed(run: Run, name: str) -> None:
     path = run.checkpoint() / name
     original = path.read_bytes()
@@ -90,7 +96,7 @@ def test_a_single_flipped_bit_anywhere_is_noticed(run: Run, name: str) -> None:
 def test_training_does_not_go_on_from_a_damaged_checkpoint(settings: Make, run: Run, name: str) -> None:
     flip(run.checkpoint() / name, -1)
     with pytest.raises(UserError, match=rf"{name}: damaged, .* delete this checkpoint's folder"):
-        train(settings(steps=2))
+        train(settings("dql", steps=2))
 
 
 def test_a_truncated_or_missing_file_is_refused(run: Run) -> None:
@@ -104,24 +110,30 @@ def test_a_truncated_or_missing_file_is_refused(run: Run) -> None:
 
 
 def test_a_checkpoint_of_another_network_is_refused(settings: Make, run: Run, tmp_path: Path) -> None:
-    other = train(settings(steps=2, network="paper", out=tmp_path / "other"))
+    other = train(settings("dql", steps=2, network="paper", out=tmp_path / "other"))
     shutil.rmtree(run.checkpoint())
     shutil.copytree(other.checkpoint(), run.checkpoints_folder / "step-00000002")
     with pytest.raises(UserError, match="of another network than its run"):
         load_acting(run.folder)
     with pytest.raises(UserError, match="of another network: expected"):
-        train(settings(steps=2))
+        train(settings("dql", steps=2))
 
 
-def test_weights_of_another_network_are_refused_even_with_a_fitting_digest(settings: Make, tmp_path: Path) -> None:
-    run = train(settings(steps=2))
-    specification = NetworkSpecification.from_json(run.config["network"])
-    other = NetworkSpecification("paper", *list(run.config["network"].values())[1:])
-    save_checkpoint(
-        run.folder / "checkpoints", new_state(other, settings(), torch.device("cpu"), {"q": 1}), specification
-    )
+def test_weights_of_another_network_are_refused_even_with_fitting_digests(run: Run, settings: Make) -> None:
+    ours = NetworkSpecification.from_json(run.config["network"])
+    state = fresh_state(dataclasses.replace(ours, name="paper"), settings("dql"))
+    networks = dataclasses.replace(state.networks, specification=ours)
+    save_checkpoint(run.checkpoints_folder, dataclasses.replace(state, networks=networks))
     with pytest.raises(UserError, match=r"action\.weight should be absent, is \[33, 4\]"):
         load_acting(run.folder, step=0)
+
+
+def test_what_an_estimator_keeps_besides_comes_back_and_is_part_of_the_digest(settings: Make) -> None:
+    run = train(settings("blend", steps=4, save_every=2))
+    later, earlier = load_acting(run.folder), load_acting(run.folder, step=2)
+    assert later.kept.keys() == {"blend_errors", "blend_rows"} and later.kept["blend_errors"].dtype == torch.float64
+    assert not torch.equal(later.kept["blend_errors"], earlier.kept["blend_errors"])
+    assert later.sha256 != earlier.sha256
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:

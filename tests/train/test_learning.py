@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 import tiny_mdp
 import torch
-from tiny_training import distance, fit, tiny_networks
+from plain import ACTION
+from tiny_training import distance, fit, tiny_networks, tiny_settings
 
 from graspq.train.checkpoint import load_acting
 from graspq.train.estimators import ESTIMATORS
+from graspq.train.estimators.pcl import policy_of
 from graspq.train.loop import train
-from graspq.train.pcl import policy_of
-from graspq.train.selection import cem_noise, cross_entropy_method
-from graspq.train.settings import TrainSettings, preset_settings
+from graspq.train.selection import cross_entropy_method, single_steps
+from graspq.train.settings import TrainSettings
 from graspq.train.state import TrainState, seeded
 
 NEAR, GAP = 0.12, 0.25
@@ -41,8 +42,6 @@ def data() -> tiny_mdp.Data:
 
 def short(**given: Any) -> TrainSettings:
     values = {
-        "algo": "mc",
-        "shards": ("none",),
         "steps": 800,
         "batch_size": 256,
         "learning_rate": 3e-3,
@@ -53,11 +52,11 @@ def short(**given: Any) -> TrainSettings:
         # 800 steps are few for an actor at a tenth of Q's rate.
         "actor_rate": 1.0,
     }
-    return preset_settings("default", **values | given)
+    return tiny_settings(**values | given)
 
 
 def learned(algo: str, data: tiny_mdp.Data, **given: Any) -> TrainState:
-    return fit(ESTIMATORS[algo], data, short(**given))
+    return fit(ESTIMATORS[algo], data, short(algo=algo, **given))
 
 
 def test_the_exact_solutions_satisfy_their_equations_and_lie_apart() -> None:
@@ -104,7 +103,7 @@ def test_supervised_reaches_the_mean_outcome_given_the_displacement(data: tiny_m
     displacement = torch.arange(tiny_mdp.PLACES) - torch.arange(tiny_mdp.PLACES).unsqueeze(1)
     synthetic = torch.zeros(*displacement.shape, 4)
     synthetic[..., 0] = displacement / 2
-    network: Any = state.acting["q"]
+    network: Any = state.acting.online["q"]
     with torch.no_grad():
         for step in range(tiny_mdp.STEPS):
             q = network.at(tiny_mdp.pictures(), torch.full((tiny_mdp.PLACES,), step))(synthetic).numpy()
@@ -119,9 +118,9 @@ def test_pcl_reaches_its_regularised_optimum_near_the_lagged_policy() -> None:
     state = learned("pcl", data, lag_steps=10_000, penalty=penalty)
     picture, step = tiny_mdp.pictures()[[0, 1, 0, 1]], torch.tensor([0, 0, 1, 1])
     with torch.no_grad():
-        lagged = policy_of(state.lagged["actor"](picture, step))
-        policy = policy_of(state.acting["actor"](picture, step))
-        value = state.acting["v"](picture, step).view(2, 2)
+        lagged = policy_of(state.networks.lagged["actor"](picture, step), ACTION)
+        policy = policy_of(state.acting.online["actor"](picture, step), ACTION)
+        value = state.acting.online["v"](picture, step).view(2, 2)
     mean, deviation = (x[:, 0].view(2, 2).double().numpy() for x in (lagged.mean, lagged.log_deviation.exp()))
     best_value, best_mean = tiny_mdp.mirrored(mean, deviation, penalty)
     assert np.abs(value.numpy() - best_value).max() < 0.03
@@ -136,7 +135,7 @@ def test_the_whole_loop_with_the_default_network_learns_from_shards_and_cem_acts
 ) -> None:
     # The process of `conftest.py`; Q* at dx > 0 and dx < 0, in state A and in state B.
     expected = torch.tensor([0.9, 0.25, 1.0, 0.0])
-    run = train(settings("dql", steps=200, batch_size=64, lag_steps=20, average_decay=0.95, validate_every=200))
+    run = train(settings("dql", steps=200, batch_size=64, lag_steps=20, average_decay=0.95, save_every=200))
     network: Any = load_acting(run.folder).networks["q"]
     shape = (two_states.size, two_states.size, 3)
     image = torch.stack([torch.full(shape, two_states.grey[state], dtype=torch.uint8) for state in "AB"])
@@ -146,7 +145,8 @@ def test_the_whole_loop_with_the_default_network_learns_from_shards_and_cem_acts
         q = network.at(image, torch.tensor([0, 1]))
         values, dx = q(actions), actions[..., 0]
         means = [values[i][side[i]].mean() for i in range(2) for side in (dx > 0.3, dx < -0.3)]
-        choice = cross_entropy_method(q, cem_noise(generator, 2))
+        noise = torch.randn(3, 2, 64, 4, generator=generator)
+        choice = cross_entropy_method(q, noise, single_steps(ACTION, noise))
     torch.testing.assert_close(torch.stack(means), expected, rtol=0, atol=0.12)
     assert bool((choice.action[:, 0] > 0).all())
     measures = [row["validation"] for row in run.metrics() if "validation" in row][-1]

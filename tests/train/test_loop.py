@@ -11,15 +11,18 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
 from graspq.train import loop
 from graspq.train.checkpoint import load_acting
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.loop import DivergedError, train
 from graspq.train.run import Run
+from graspq.train.selection import Acting, CemSettings
 from graspq.train.settings import TrainSettings
 
 Make = Callable[..., TrainSettings]
@@ -35,10 +38,11 @@ def same_checkpoints(first: Path, second: Path) -> bool:
 def test_twenty_steps_equal_ten_steps_a_checkpoint_and_ten_steps_bit_by_bit(
     settings: Make, tmp_path: Path, algo: str
 ) -> None:
-    unbroken = train(settings(algo, out=tmp_path / "unbroken", lag_steps=7))
-    train(settings(algo, out=tmp_path / "broken", lag_steps=7), stop_at=10)
+    own = {"lag_steps": 7} if hasattr(ESTIMATORS[algo].settings(), "lag_steps") else {}
+    unbroken = train(settings(algo, out=tmp_path / "unbroken", **own))
+    train(settings(algo, out=tmp_path / "broken", **own), stop_at=10)
     torch.manual_seed(99)
-    resumed = train(settings(algo, out=tmp_path / "broken", lag_steps=7))
+    resumed = train(settings(algo, out=tmp_path / "broken", **own))
     assert [row["step"] for row in resumed.metrics()] == [row["step"] for row in unbroken.metrics()]
     assert same_checkpoints(unbroken.checkpoint(), resumed.checkpoint())
 
@@ -82,8 +86,8 @@ def test_metrics_have_losses_rates_and_validation(settings: Make) -> None:
     run = train(settings())
     rows = run.metrics()
     training = [row for row in rows if "loss" in row]
-    assert [row["step"] for row in training] == [5, 10, 15, 20]
-    assert set(training[0]) == {"step", "loss", "samples_per_second", "learning_rate"}
+    assert [row["step"] for row in training] == [10, 20]
+    assert set(training[0]) == {"step", "loss", "q", "target", "samples_per_second", "learning_rate"}
     validation = [row for row in rows if "validation" in row]
     assert [row["step"] for row in validation] == [10, 20]
     measures = validation[-1]["validation"]
@@ -94,9 +98,9 @@ def test_metrics_have_losses_rates_and_validation(settings: Make) -> None:
 
 def test_the_configuration_names_settings_data_versions_and_precision(settings: Make) -> None:
     config = json.loads((train(settings(steps=2)).folder / "config.json").read_text())
-    assert config["settings"]["algo"] == "mc" and config["discount"] == 1.0
+    assert config["settings"]["algo"] == "mc" and config["dataset"]["discount"] == 1.0
     assert len(config["dataset"]["manifest_sha256"]) == 64 and config["dataset"]["task"]["name"] == "two-states"
-    assert config["precision"] == {"name": "float32", "device": "cpu", "probe": {"asked": "float32"}}
+    assert config["precision"] == "float32"
     assert "torch" in config["versions"] and config["code_revision"]
     assert config["network"]["name"] == "default"
     split = config["dataset"]["training"]["blocks"], config["dataset"]["held_back"]["blocks"]
@@ -104,8 +108,8 @@ def test_the_configuration_names_settings_data_versions_and_precision(settings: 
 
 
 def test_only_the_newest_checkpoints_are_kept(settings: Make) -> None:
-    run = train(settings(steps=10, checkpoint_every=2, keep_checkpoints=2))
-    assert [path.name for path in run.checkpoints()] == ["step-00000008", "step-00000010"]
+    run = train(settings(steps=10, save_every=2))
+    assert [path.name for path in run.checkpoints()] == ["step-00000006", "step-00000008", "step-00000010"]
 
 
 def test_a_run_of_another_configuration_is_not_touched(
@@ -117,7 +121,7 @@ def test_a_run_of_another_configuration_is_not_touched(
     other = two_states.dataset(tmp_path / "other", 50)
     with pytest.raises(UserError, match="another dataset"):
         train(settings(steps=4, shards=(str(other),)))
-    train(settings(steps=4, log_every=1, threads=None))
+    train(settings(steps=4, save_every=1, threads=None))
 
 
 def test_data_that_has_moved_is_the_same_data(settings: Make, two_states: SimpleNamespace, tmp_path: Path) -> None:
@@ -135,45 +139,40 @@ def test_a_folder_of_something_else_is_not_touched(settings: Make, tmp_path: Pat
 
 def test_two_trainings_do_not_share_a_folder(settings: Make) -> None:
     run = train(settings(steps=2))
-    with run.locked(), pytest.raises(UserError, match="another process trains here"):
+    with run.locked(), pytest.raises(UserError, match="another training works here"):
         train(settings(steps=2))
 
 
 def test_another_discount_makes_the_returns_of_mc_anew_and_says_so(
-    settings: Make, capsys: pytest.CaptureFixture[str]
+    settings: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = train(settings("mc", discount=0.5, steps=2)).config
-    assert config["discount"] == 0.5 and config["dataset"]["discount"] == 1.0
-    assert config["mc_return"] == "made from the rewards with discount 0.5"
+    seen, said = [], []
+    for discount in (None, 1.0, 0.5):
+        run = train(settings("mc", discount=discount, steps=2, out=tmp_path / str(discount)))
+        assert run.config["settings"]["own"]["discount"] == discount and run.config["dataset"]["discount"] == 1.0
+        seen.append(next(row["target"] for row in run.metrics() if "target" in row))
+        said.append((run.config["discount"], run.config["mc_return"]))
+    assert seen[0] == seen[1] > seen[2]
+    assert said == [(1.0, "as stored")] * 2 + [(0.5, "made from the rewards with discount 0.5")]
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "mc: returns are made from the rewards with discount 0.5; the data's are of discount 1"
 
 
-def test_the_datasets_own_discount_needs_no_word(settings: Make, capsys: pytest.CaptureFixture[str]) -> None:
-    assert train(settings("mc", steps=2)).config["mc_return"] == "as stored"
-    assert capsys.readouterr().err == ""
-
-
-def test_a_discount_for_supervised_is_refused(settings: Make) -> None:
-    with pytest.raises(UserError, match=r"--discount: .* have no discount, got 0\.9"):
-        train(settings("supervised", discount=0.9))
-
-
 def test_divergence_stops_with_estimator_step_quantity_and_the_last_good_checkpoint(settings: Make) -> None:
     with pytest.raises(DivergedError) as error:
-        train(settings("mc", preset="paper", network="default", steps=40, learning_rate=1e30, checkpoint_every=1))
+        train(settings("mc", preset="paper", network="default", steps=40, learning_rate=1e30, save_every=1))
     message = str(error.value)
     assert message.startswith("mc diverged at step ") and "is not finite" in message and "\n" not in message
 
 
 def test_the_step_of_a_loss_that_is_not_finite_is_named_and_the_checkpoint_before_it_kept(settings: Make) -> None:
-    chosen = settings(steps=30, checkpoint_every=3, log_every=100)
+    chosen = settings(steps=30, save_every=3)
     run = train(chosen, stop_at=3)
 
     class Poisoned(loop.Session):
-        def update(self, batch: loop.Batch, part: loop.BatchPart) -> torch.Tensor:
-            loss = super().update(batch, part)
-            return loss * torch.nan if self.state.step == 5 else loss
+        def update(self, batch: loop.Batch) -> loop.Metrics:
+            metrics = super().update(batch)
+            return metrics | {"loss": metrics["loss"] * torch.nan} if self.state.step == 5 else metrics
 
     original = loop.Session
     loop.Session = Poisoned  # type: ignore[misc]
@@ -191,7 +190,7 @@ COMMAND = "from graspq.train.cli import main; main()"
 def command(settings: TrainSettings, *more: str) -> list[str]:
     assert settings.out is not None
     options = ["--algo", settings.algo, "--shards", *settings.shards, "--out", str(settings.out), "--steps", "5000"]
-    options += ["--batch-size", "8", "--precision", "float32", "--threads", "1", "--checkpoint-every", "10"]
+    options += ["--batch-size", "8", "--precision", "float32", "--threads", "1", "--save-every", "10"]
     return [sys.executable, "-c", COMMAND, *options, *more]
 
 
@@ -243,3 +242,35 @@ def test_training_works_outside_the_main_thread(settings: Make) -> None:
     thread.start()
     thread.join(60)
     assert done and done[0].checkpoint().name == "step-00000002"
+
+
+FIVE_PARTS = ActionSpace(
+    names=("dx", "dy", "dz", "dphi", "dtheta"),
+    pose=("x", "y", "z", "phi", "theta"),
+    units=("m", "m", "m", "rad", "rad"),
+    limits=(0.05, 0.05, 0.05, 0.3, 0.2),
+    mirror=None,
+    start=(0.0, 0.0, 0.0, 0.0, 0.5),
+)
+
+
+@pytest.fixture(scope="module")
+def five_parts(two_states: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = two_states.dataset(tmp_path_factory.mktemp("five") / "parts", 20, action=FIVE_PARTS)
+    return folder
+
+
+@pytest.mark.parametrize("network", ["default", "paper"])
+@pytest.mark.parametrize("algo", ESTIMATORS)
+def test_actions_of_five_parts_without_a_mirror_plane_train_every_row_and_act(
+    settings: Make, five_parts: Path, algo: str, network: str
+) -> None:
+    run = train(settings(algo, shards=(str(five_parts),), network=network, steps=3, batch_size=16))
+    loaded = load_acting(run.folder)
+    assert loaded.specification.action == FIVE_PARTS
+    bounds = torch.full((5,), -1.0), torch.full((5,), 1.0)
+    acting = Acting(loaded.networks, loaded.kept, loaded.specification.action, bounds)
+    image, step = torch.zeros(1, 16, 16, 3, dtype=torch.uint8), torch.zeros(1, dtype=torch.int64)
+    pose, random = torch.zeros(1, 5), np.random.default_rng(0)
+    action, _ = ESTIMATORS[algo].action_selection.act(acting, image, step, pose, random, CemSettings())
+    assert action.shape == (1, 5) and float(action.abs().max()) <= 1

@@ -1,28 +1,39 @@
 """Networks: split heads against unsplit ones, trunks that run once, batch normalisation that stays as it is."""
 
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from plain import specification
 from torch import Tensor, nn
 from torch.nn import functional
 
+from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
-from graspq.train.default_network import DefaultNetwork
-from graspq.train.networks import NETWORKS, NetworkSpecification, QNetwork, make_network, make_state_network
-from graspq.train.paper_network import PaperNetwork
+from graspq.train.networks import NETWORKS, build, network_named, q_network, state_network
+from graspq.train.networks.default import DefaultNetwork
+from graspq.train.networks.network import QNetwork
+from graspq.train.networks.paper import PaperNetwork
 from graspq.train.state import seeded
 
 BATCH, CANDIDATES = 3, 5
 
 
-def specification(name: str, size: int = 64, link: str = "logistic") -> NetworkSpecification:
-    return NetworkSpecification(name, (size, size, 3), 4, 15, link)  # type: ignore[arg-type]
+def make_network(name: str, size: int = 64, weights: int = 0, **given: Any) -> QNetwork:
+    network = build(q_network, specification(name, size, **given), seeded("tests/weights", weights))
+    assert isinstance(network, QNetwork)
+    return network
+
+
+def make_state_network(name: str, outputs: int = 8) -> nn.Module:
+    return build(state_network(outputs), specification(name, 64), seeded("tests/weights"))
 
 
 def made(name: str, size: int = 64) -> QNetwork:
     """A network in evaluation mode with weights, gains and statistics away from their special starting values."""
-    network = make_network(specification(name, size), seeded("tests/weights")).train()
+    network = make_network(name, size).train()
     generator = seeded("tests/shake")
     for parameter in network.parameters():
         parameter.data += 0.1 * (torch.rand(parameter.shape, generator=generator) - 0.5)
@@ -73,7 +84,7 @@ def test_the_paper_network_equals_its_unsplit_form() -> None:
 
 
 def test_the_paper_network_has_the_papers_sizes() -> None:
-    network = make_network(specification("paper"), seeded("tests/weights"))
+    network = make_network("paper")
     shapes = {name: list(value.shape) for name, value in network.named_parameters() if value.dim() > 1}
     assert shapes == {
         "map.convolutions.0.weight": [32, 3, 3, 3],
@@ -91,7 +102,7 @@ def test_the_paper_network_has_the_papers_sizes() -> None:
 
 @torch.no_grad()
 def test_layer_normalisation_of_the_paper_network_is_over_height_width_and_channels() -> None:
-    network = make_network(specification("paper"), seeded("tests/weights"))
+    network = make_network("paper")
     assert isinstance(network, PaperNetwork)
     x = torch.rand(2, 32, 5, 5, generator=seeded("tests/x"))
     expected = functional.relu(functional.layer_norm(x, [32, 5, 5], eps=1e-12))
@@ -128,7 +139,7 @@ def test_evaluation_passes_leave_batch_statistics_alone_and_do_not_use_the_batch
 def test_q_is_a_probability_with_the_logistic_link_and_the_raw_output_without() -> None:
     image, step, action = states()
     for link in ("logistic", "identity"):
-        network = make_network(specification("paper", link=link), seeded("tests/weights")).eval()
+        network = make_network("paper", link=link).eval()
         raw = network(image, step, action[:, 0])
         q = network.at(image, step)(action[:, :1]).squeeze(1)
         torch.testing.assert_close(q, raw.sigmoid() if link == "logistic" else raw)
@@ -136,21 +147,17 @@ def test_q_is_a_probability_with_the_logistic_link_and_the_raw_output_without() 
 
 def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
     torch.manual_seed(1)
-    first = make_network(specification("default"), seeded("tests/weights", 0)).state_dict()
+    first = make_network("default").state_dict()
     torch.manual_seed(2)
-    again = make_network(specification("default"), seeded("tests/weights", 0)).state_dict()
-    other = make_network(specification("default"), seeded("tests/weights", 1)).state_dict()
+    again = make_network("default").state_dict()
+    other = make_network("default", weights=1).state_dict()
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not torch.equal(first["last.weight"], other["last.weight"])
 
 
 @pytest.mark.parametrize("name", list(NETWORKS))
 def test_filters_of_a_fresh_network_lie_channels_last_in_memory_as_the_images_do(name: str) -> None:
-    made = [
-        make_network(specification(name), seeded("tests/weights")),
-        make_state_network(specification(name), 8, seeded("tests/weights")),
-    ]
-    for network in made:
+    for network in (make_network(name), make_state_network(name)):
         filters = [weights for weights in network.parameters() if weights.dim() == 4]
         assert all(weights.is_contiguous(memory_format=torch.channels_last) for weights in filters)
         # Filters of one pixel or one channel lie both ways.
@@ -160,12 +167,12 @@ def test_filters_of_a_fresh_network_lie_channels_last_in_memory_as_the_images_do
 @pytest.mark.parametrize(("name", "size"), [("default", 20), ("default", 8), ("paper", 14)])
 def test_images_that_a_network_cannot_take_are_refused_in_one_line(name: str, size: int) -> None:
     with pytest.raises(UserError, match="images of"):
-        make_network(specification(name, size))
+        make_network(name, size)
 
 
 def test_an_unknown_network_is_refused_with_the_choices() -> None:
     with pytest.raises(UserError, match="choose from default, paper"):
-        make_network(specification("resnet"))
+        make_network("resnet")
 
 
 @torch.no_grad()
@@ -210,7 +217,7 @@ def test_a_look_reads_the_map_where_the_action_leads() -> None:
 
 @pytest.mark.parametrize("name", list(NETWORKS))
 def test_a_function_of_the_state_has_the_asked_outputs_and_reads_image_and_step(name: str) -> None:
-    network = make_state_network(specification(name), 8, seeded("tests/weights"))
+    network = make_state_network(name)
     generator = seeded("tests/shake")
     for parameter in network.parameters():
         parameter.data += 0.1 * (torch.rand(parameter.shape, generator=generator) - 0.5)
@@ -221,3 +228,40 @@ def test_a_function_of_the_state_has_the_asked_outputs_and_reads_image_and_step(
     assert outputs.shape == (BATCH, 8) and outputs.dtype == torch.float32
     assert float(outputs.std(dim=0).min()) > 1e-4
     assert float((outputs[:2] - later[:2]).abs().max()) > 1e-4 and torch.equal(outputs[2], later[2])
+
+
+@pytest.mark.parametrize("name", list(NETWORKS))
+@torch.no_grad()
+def test_actions_have_as_many_parts_as_their_space(name: str) -> None:
+    space = ActionSpace(tuple("abcde"), tuple("vwxyz"), ("m",) * 5, (0.1,) * 5, None, (0.0,) * 5)
+    network = make_network(name, action=space).eval()
+    image, step, _ = states()
+    action = torch.rand(BATCH, CANDIDATES, 5, generator=seeded("tests/five")) * 2 - 1
+    assert network.at(image, step)(action).shape == (BATCH, CANDIDATES)
+    # The fifth part matters, however little at first.
+    changed = action + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5])
+    raw, other = (network.head(network.trunk(image, step), one) for one in (action, changed))
+    assert not torch.equal(raw, other)
+
+
+def test_the_papers_network_has_the_width_that_its_option_says() -> None:
+    network = make_network("paper", settings={"width": 8})
+    assert isinstance(network, PaperNetwork)
+    assert network.first.weight.shape == (8, 9 * 7 * 7) and network.last.weight.shape == (1, 8)
+
+
+OWN_FAMILY = """
+from graspq.train.networks.network import NetworkFamily
+from graspq.train.networks.paper import PaperNetwork, PaperNetworkSettings, PaperStateNetwork
+family = NetworkFamily(PaperNetwork, PaperStateNetwork, PaperNetworkSettings)
+wrong = PaperNetwork
+"""
+
+
+def test_a_users_own_family_is_found_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_networks.py").write_text(OWN_FAMILY)
+    monkeypatch.chdir(tmp_path)
+    assert network_named("own_networks:family").q is PaperNetwork
+    assert isinstance(make_network("own_networks:family"), PaperNetwork)
+    with pytest.raises(UserError, match="--network own_networks:wrong: expected NetworkFamily, got type"):
+        network_named("own_networks:wrong")

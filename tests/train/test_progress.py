@@ -10,7 +10,7 @@ import torch
 from graspq.train import loop
 from graspq.train.checkpoint import load_acting
 from graspq.train.loop import DivergedError, train
-from graspq.train.networks import QNetwork
+from graspq.train.networks.network import QNetwork
 from graspq.train.progress import Progress
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
@@ -19,10 +19,10 @@ Make = Callable[..., TrainSettings]
 
 
 def logged(settings: TrainSettings, folder: Path, steps: list[tuple[float, float]]) -> tuple[int, str] | None:
-    with Progress(Run(folder, {}), settings, 40, show=False) as progress:
+    with Progress(Run(folder, {}), settings, 40, show=False, writes=True) as progress:
         for loss, q in steps:
             with progress.timed():
-                progress.count(torch.tensor(loss), {"Q": torch.tensor(q)})
+                progress.count({"loss": torch.tensor(loss), "q": torch.tensor(q)})
         return progress.log(40 + len(steps), 0.1)
 
 
@@ -34,8 +34,8 @@ def test_values_of_the_tasks_size_are_logged(settings: Make, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("steps", "found"),
     [
-        ([(0.1, 0.5), (0.1, 10.5), (0.1, 99.0)], (42, "mean |Q| is 10.5, and returns lie in [0, 1]")),
-        ([(0.1, 0.5), (0.1, 0.5), (0.1, float("nan"))], (43, "mean |Q| is nan, and returns lie in [0, 1]")),
+        ([(0.1, 0.5), (0.1, 10.5), (0.1, 99.0)], (42, "mean |q| is 10.5, and returns lie in [0, 1]")),
+        ([(0.1, 0.5), (0.1, 0.5), (0.1, float("nan"))], (43, "mean |q| is not finite")),
         ([(float("inf"), 99.0), (0.1, 0.5)], (41, "loss is not finite")),
     ],
 )
@@ -47,18 +47,20 @@ def test_the_first_step_and_quantity_beyond_what_the_task_allows_are_named_and_n
 
 
 @pytest.mark.parametrize(
-    ("algo", "quantity"), [("mc", "Q"), ("dql", "Q|target"), ("ddpg", "Q|target"), ("pcl", "V|target")]
+    ("algo", "quantity"), [("mc", "q"), ("dql", "q|target"), ("ddpg", "q|target"), ("pcl", "v|target")]
 )
 def test_a_run_whose_values_grow_out_of_reason_stops_and_keeps_the_checkpoint_before(
     settings: Make, monkeypatch: pytest.MonkeyPatch, algo: str, quantity: str
 ) -> None:
     # Three good steps, and a fourth after which no value is one of a return: the fifth finds them.
     monkeypatch.setattr(loop, "learning_rate", lambda settings, step: 1e-3 if step < 3 else 3.0)
-    chosen = settings(algo, preset="paper", steps=40, checkpoint_every=1, log_every=1)
+    chosen = settings(algo, preset="paper", steps=40, save_every=1)
     with pytest.raises(DivergedError) as error:
         train(chosen)
     message = str(error.value)
-    found = re.match(rf"{algo} diverged at step (\d+): the mean \|({quantity})\| is \S+, and .*; (.+); ", message)
+    found = re.match(
+        rf"{algo} diverged at step (\d+): the (?:loss|mean \|({quantity})\|) is \S+, and .*; (.+); ", message
+    )
     assert found is not None, message
     loaded = load_acting(chosen.run_folder)
     assert loaded.step == 3 and int(found[1]) == 5

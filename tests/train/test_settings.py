@@ -1,68 +1,97 @@
-"""Presets: the paper's numbers, and options that win over them."""
+"""Settings: the paper's numbers, options that win over a preset, and what is refused."""
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.train.settings import PRESETS, TrainOptions, TrainSettings, preset_settings, resolve
+from graspq.train.estimators import ESTIMATORS
+from graspq.train.recipe import Recipe
+from graspq.train.settings import Preset, TrainSettings, complete
+
+# What the paper's text gives (P), and where it is silent its released code (C).
+COMMON = {
+    "network": "paper",  # C: cnn_ia_v1; P, figure 3
+    "batch_size": 32,  # C: get_data
+    "learning_rate": 1e-3,  # C
+    "weight_decay": 0.0,  # C: Adam, no L2
+    "schedule": "constant",  # C
+    "warmup": 0.0,
+    "average_decay": 0.0,
+    "shift": 0,  # C: no augmentation
+    "mirror": False,
+    "steps": 2_000_000,  # C: env_procedural
+    "precision": "float32",
+}
+SQUARED: dict[str, Any] = {"loss": "squared"}  # P, equations
+DOUBLE_Q = SQUARED | {"discount": 0.9, "lag_steps": 50}  # P: every 50 gradient updates
+CORRECTED = SQUARED | {"discount": 0.9, "candidates": 16, "centred": False, "look_in_mirror": False}
+OWN: dict[str, dict[str, Any]] = {
+    "supervised": SQUARED,
+    "dql": DOUBLE_Q | {"candidates": 16},  # P: 16 actions uniformly at random
+    "mc": SQUARED | {"discount": None},  # P, footnote; C
+    "corr-mc": CORRECTED | {"lag_steps": 100, "anneal": 0.05},  # C: 100,000 of 2 million steps
+    "ddpg": DOUBLE_Q | {"actor_rest": 0.0, "actor_rate": 1.0, "actor_every": 1},
+    # Configuration of the authors' Trust-PCL for grasping.
+    "pcl": {
+        "discount": 0.95,
+        "lag_steps": 50,
+        "actor_rate": 1.0,
+        "path_steps": 10,
+        "penalty": 3.0,
+        "kl_bound": 0.02,
+    },
+    "blend": CORRECTED | {"lag_steps": 50},  # not the paper's: as its parents
+}
+RECIPES: dict[str, dict[str, Any]] = {
+    "corr-mc": {"learning_rate": 1e-4},
+    "pcl": {"learning_rate": 1e-4, "batch_size": 64},
+}
 
 
-def given(**options: object) -> TrainSettings:
-    return resolve(TrainOptions(**{"algo": "dql", "shards": ("data",)} | options))
+def given(preset: Preset = "default", **options: Any) -> TrainSettings:
+    return complete({"algo": "dql", "shards": ("data",)} | options, preset)
 
 
-def test_the_paper_preset_has_the_papers_settings() -> None:
-    settings = given(preset="paper")
-    assert settings.network == "paper"
-    assert settings.loss == "squared"
-    assert settings.batch_size == 32
-    assert settings.learning_rate == 1e-3
-    assert settings.weight_decay == 0.0, "Adam"
-    assert settings.schedule == "constant" and settings.warmup == 0.0
-    assert settings.average_decay == 0.0
-    assert (settings.shift, settings.mirror, settings.jitter) == (0, False, 0.0), "no augmentation"
-    assert settings.lag_steps == 50
-    assert settings.candidates == 16
-    assert settings.steps == 2_000_000
-    assert (settings.anneal, settings.centred) == (0.05, False), "100,000 of 2 million steps"
-    assert (settings.actor_rest, settings.actor_rate, settings.actor_every) == (0.0, 1.0, 1)
-    assert (settings.path_steps, settings.penalty, settings.precision) == (10, 3.0, "float32")
+@pytest.mark.parametrize("algo", ESTIMATORS)
+def test_the_paper_preset_has_the_papers_values_for_every_estimator(algo: str) -> None:
+    settings = given("paper", algo=algo)
+    recipe = {field.name: getattr(settings, field.name) for field in dataclasses.fields(Recipe)}
+    assert recipe == COMMON | RECIPES.get(algo, {})
+    assert settings.own.to_json() == OWN[algo]
+    assert settings.network_own.to_json() == {"width": 32}
 
 
-def test_the_paper_preset_has_what_the_authors_code_has_for_one_estimator_alone() -> None:
-    corrected, paths = given(algo="corr-mc", preset="paper"), given(algo="pcl", preset="paper")
-    assert (corrected.learning_rate, corrected.lag_steps, corrected.batch_size) == (1e-4, 100, 32)
-    assert (paths.learning_rate, paths.lag_steps, paths.batch_size, paths.discount) == (1e-4, 50, 64, 0.95)
-    assert preset_settings("paper", algo="pcl", shards=("data",)) == paths
-    chosen = given(algo="pcl", preset="paper", discount=0.9, learning_rate=0.01, batch_size=32, lag_steps=7)
-    assert (chosen.discount, chosen.learning_rate, chosen.batch_size, chosen.lag_steps) == (0.9, 0.01, 32, 7)
-    assert given(algo="pcl").learning_rate == given(algo="dql").learning_rate
+@pytest.mark.parametrize("algo", ESTIMATORS)
+def test_the_default_recipe_is_one_for_all_estimators(algo: str) -> None:
+    settings = given(algo=algo)
+    assert all(getattr(settings, field.name) == field.default for field in dataclasses.fields(Recipe))
+    assert settings.own == ESTIMATORS[algo].settings()
 
 
 def test_options_that_are_given_win_over_the_preset_even_when_they_are_its_opposite_or_zero() -> None:
-    settings = given(preset="paper", batch_size=64, mirror=True, weight_decay=0.5, network="default")
+    settings = given("paper", batch_size=64, mirror=True, weight_decay=0.5, network="default", loss="cross-entropy")
     assert (settings.batch_size, settings.mirror, settings.weight_decay) == (64, True, 0.5)
-    assert settings.network == "default" and settings.loss == "squared"
-    assert given(preset="default", shift=0, mirror=False).shift == 0
-    assert given(preset="default", mirror=False).mirror is False
+    assert settings.network == "default" and settings.own.to_json()["loss"] == "cross-entropy"
+    assert (given(shift=0).shift, given(mirror=False).mirror) == (0, False)
+    chosen = given("paper", algo="pcl", discount=0.9, learning_rate=0.01, batch_size=32, lag_steps=7)
+    own = chosen.own.to_json()
+    assert (own["discount"], chosen.learning_rate, chosen.batch_size, own["lag_steps"]) == (0.9, 0.01, 32, 7)
 
 
-def test_without_a_preset_the_default_one_decides_and_equals_plain_settings() -> None:
-    assert (
-        given()
-        == TrainSettings(algo="dql", shards=("data",))
-        == preset_settings("default", algo="dql", shards=("data",))
-    )
-
-
-def test_both_presets_govern_the_same_settings() -> None:
-    assert PRESETS["default"].keys() == PRESETS["paper"].keys()
+def test_none_that_is_given_wins_over_the_preset_too() -> None:
+    own = given("paper", algo="pcl", penalty=None, path_steps=None).own.to_json()
+    assert own["penalty"] is None and own["path_steps"] is None
+    own = given("paper", algo="pcl", penalty=None).own.to_json()
+    assert own["penalty"] is None and own["path_steps"] == 10
 
 
 def test_settings_survive_json() -> None:
-    settings = preset_settings("paper", algo="mc", shards=("a", "b"), out=Path("runs/x"), discount=1.0)
-    assert TrainSettings.from_json(settings.to_json()) == settings
+    for algo in ESTIMATORS:
+        settings = given("paper", algo=algo, shards=("a", "b"), out=Path("runs/x"), width=16)
+        assert TrainSettings.from_json(settings.to_json()) == settings
 
 
 @pytest.mark.parametrize(
@@ -75,11 +104,20 @@ def test_settings_survive_json() -> None:
         ({"discount": 1.5}, "--discount"),
         ({"average_decay": 1.0}, "--average-decay"),
         ({"shards": ()}, "--shards"),
+        ({"anneal": 0.5}, "--anneal belongs to --algo corr-mc; it is no option of --algo dql with --network default"),
+        ({"width": 8}, "--width belongs to --network paper; it is no option of --algo dql with --network default"),
+        ({"speed": 1}, "No such option: --speed .with --algo dql and --network default."),
+        ({"algo": "supervised", "discount": 1.0}, "--discount belongs to .*; it is no option of --algo supervised"),
     ],
 )
-def test_values_out_of_range_are_refused(wrong: dict[str, object], message: str) -> None:
+def test_values_out_of_range_and_options_of_others_are_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(UserError, match=message):
         given(**wrong)
+
+
+def test_an_estimator_must_be_named() -> None:
+    with pytest.raises(UserError, match=r"--algo: expected an estimator: supervised, dql, mc, .* or module:row"):
+        complete({"shards": ("data",)})
 
 
 @pytest.mark.parametrize(
@@ -92,4 +130,14 @@ def test_values_out_of_range_are_refused(wrong: dict[str, object], message: str)
     ],
 )
 def test_the_default_run_folder_names_estimator_dataset_and_seed(shards: tuple[str, ...], name: str) -> None:
-    assert TrainSettings(algo="mc", shards=shards).run_folder == Path("runs") / name
+    assert given(algo="mc", shards=shards).run_folder == Path("runs") / name
+
+
+def test_discounts_are_the_estimators_own_the_datasets_or_those_given() -> None:
+    def chosen(algo: str, stored: float, **options: Any) -> float:
+        return given(algo=algo, **options).own.chosen_discount(stored)
+
+    assert chosen("dql", 1.0) == chosen("corr-mc", 1.0) == 0.9
+    assert chosen("dql", 1.0, discount=0.0) == 0.0
+    assert (chosen("mc", 1.0), chosen("mc", 0.95), chosen("mc", 1.0, discount=0.0)) == (1.0, 0.95, 0.0)
+    assert chosen("supervised", 0.95) == 1.0

@@ -4,19 +4,23 @@ Dimensions: B batch, T = 3 steps, X = 3 places, A = 4 action, G × G grid of act
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
-from tiny_mdp import AXIS, DISCOUNT, PLACES, SIZE, STEPS, Data, Floats, pictures
+from tiny_mdp import AXIS, PLACES, SIZE, STEPS, Data, Floats, pictures
 from torch import Tensor, nn
 
-from graspq.train import networks
-from graspq.train.estimators import Estimator
-from graspq.train.networks import Features, NetworkSpecification, QNetwork, StateNetwork
-from graspq.train.settings import TrainSettings
-from graspq.train.state import Context, TrainState, advance, learning_rate, new_state, seeded
-from graspq.train.updates import LINKS
+from graspq.common.action_space import grasping
+from graspq.train.device import Precision
+from graspq.train.estimator import Estimator
+from graspq.train.estimators import estimator_named
+from graspq.train.networks import NETWORKS
+from graspq.train.networks.network import Features, NetworkFamily, NetworkSpecification, QNetwork, StateNetwork
+from graspq.train.settings import TrainSettings, complete
+from graspq.train.state import TrainState, advance, learning_rate, new_state, seeded
 
 WIDTH = 48
 COARSE = slice(None, None, 10)
@@ -33,6 +37,7 @@ class TinyNetwork(QNetwork):
 
     def __init__(self, specification: NetworkSpecification) -> None:
         super().__init__()
+        self.link = specification.link
         self.state = nn.Linear(PLACES + STEPS, WIDTH)
         self.state_and_step = nn.Linear(WIDTH, WIDTH)
         self.action = nn.Linear(4, WIDTH, bias=False)
@@ -66,14 +71,22 @@ class TinyStateNetwork(StateNetwork):
 @contextlib.contextmanager
 def tiny_networks() -> Iterator[None]:
     """Enter the tiny networks into the table of networks for a while."""
-    networks.NETWORKS["tiny"] = lambda: networks._Family(TinyNetwork, TinyStateNetwork)
+    NETWORKS["tiny"] = NetworkFamily(TinyNetwork, TinyStateNetwork)
     try:
         yield
     finally:
-        del networks.NETWORKS["tiny"]
+        del NETWORKS["tiny"]
 
 
-def fit(row: Estimator, data: Data, settings: TrainSettings) -> TrainState:
+def tiny_settings(**given: Any) -> TrainSettings:
+    """Return settings with the tiny networks; options that the estimator does not have are left out."""
+    own = {field.name for field in dataclasses.fields(estimator_named(given["algo"]).settings)}
+    common = {field.name for field in dataclasses.fields(TrainSettings)}
+    known = {name: value for name, value in given.items() if name in own | common}
+    return complete({"shards": ("none",), "network": "tiny", "precision": "float32"} | known)
+
+
+def fit(row: Estimator[Any], data: Data, settings: TrainSettings) -> TrainState:
     """Train an estimator by its own update; batches are drawn with replacement.
 
     Args:
@@ -81,46 +94,23 @@ def fit(row: Estimator, data: Data, settings: TrainSettings) -> TrainState:
         data: what it learns from.
         settings: steps, batch size (transitions), learning rate, loss and so on.
     """
-    specification = NetworkSpecification("tiny", (SIZE, SIZE, 3), 4, STEPS, LINKS[settings.loss])
-    state = new_state(specification, settings, torch.device("cpu"), row.parts)
-    state.extra = row.extra(data)  # type: ignore[arg-type]
+    action = grasping((0.06, 0.06, 0.06, 0.4))
+    specification = NetworkSpecification("tiny", (SIZE, SIZE, 3), action, STEPS, row.loss(settings.own).link)
+    precision, lag_steps = Precision("float32", torch.device("cpu")), getattr(settings.own, "lag_steps", None)
+    state = new_state(specification, row.parts, settings, settings.seed, precision, lagged=lag_steps is not None)
+    state.networks.kept.update(row.kept(data, settings.own))  # type: ignore[arg-type]
     while state.step < settings.steps:
         generator = seeded("tests/tiny", settings.seed, state.step)
-        if row.view == "episodes":
+        if row.target_value.view == "episodes":
             size = settings.batch_size * data.episodes // data.rows
             batch = data.whole_episodes(torch.randint(data.episodes, (size,), generator=generator))
         else:
             batch = data.transitions(torch.randint(data.rows, (settings.batch_size,), generator=generator))
-        for optimizer in state.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate(settings, state.step)
-        row.update(state, batch, row, context(state, settings, generator))
-        advance(state, settings)
+        for part in state.optimizers:
+            state.set_rate(part, learning_rate(settings, state.step))
+        row.update(row, state, batch, settings.own, generator, state.step / settings.steps)
+        advance(state, settings.average_decay, lag_steps)
     return state
-
-
-def context(state: TrainState, settings: TrainSettings, generator: torch.Generator) -> Context:
-    """Return the context of one update."""
-    return Context(
-        networks=state.learned,
-        lagged_networks=state.lagged,
-        loss=settings.loss,
-        discount=DISCOUNT if settings.discount is None else settings.discount,
-        candidates=settings.candidates,
-        generator=generator,
-        progress=state.step / settings.steps,
-        autocast=contextlib.nullcontext,
-        anneal=settings.anneal,
-        centred=settings.centred,
-        mirror=settings.mirror,
-        actor_rest=settings.actor_rest,
-        actor_rate=settings.actor_rate,
-        actor_every=settings.actor_every,
-        path_steps=settings.path_steps,
-        penalty=settings.penalty,
-        kl_bound=settings.kl_bound,
-        extra=state.extra,
-    )
 
 
 @torch.no_grad()
@@ -130,7 +120,7 @@ def q_on_grid(state: TrainState) -> Floats:
     action = torch.zeros(len(axis), len(axis), 4)
     action[..., 0], action[..., 2] = axis[:, None], axis[None, :]
     result = []
-    network = state.acting["q"]
+    network = state.acting.online["q"]
     assert isinstance(network, QNetwork)
     network.eval()
     for step in range(STEPS):

@@ -1,17 +1,27 @@
 """`corr-mc` on Q-functions whose values are known: its advantages, its annealing, and the bias of what it does."""
 
+from typing import Any
+
 import pytest
 import torch
-from plain_context import plain_context
+from plain import plain_networks
 from torch import Tensor
 
 from graspq.train.batch import Batch
-from graspq.train.corrected import Judged, advantages, annealed, centred_advantage, corrected_target, judged
-from graspq.train.networks import Features, QNetwork
+from graspq.train.estimator import cross_entropy
+from graspq.train.estimators.corr_mc import (
+    CorrMcSettings,
+    Judged,
+    advantages,
+    annealed,
+    centred_advantage,
+    judged,
+    target,
+)
+from graspq.train.networks.network import Features, QNetwork
 from graspq.train.selection import uniform_actions
-from graspq.train.state import Context, seeded
+from graspq.train.state import Networks, seeded
 from graspq.train.targets import corrected_episode_value
-from graspq.train.updates import cross_entropy
 
 MASK = torch.tensor([[True, True, True], [True, False, False], [True, True, False]])
 
@@ -37,13 +47,25 @@ class Peak(QNetwork):
         return (features[0].unsqueeze(1) + self.deviation * torch.special.ndtri(uniform.clamp(1e-9, 1 - 1e-9))).float()
 
 
-def context(lagged: QNetwork, network: QNetwork | None = None, **given: object) -> Context:
-    plain: dict[str, object] = {"loss": "cross-entropy", "progress": 1.0, "anneal": 0.5}
-    return plain_context({"q": Peak() if network is None else network}, {"q": lagged}, **plain | given)
+def networks(lagged: QNetwork, network: QNetwork | None = None) -> Networks:
+    return plain_networks({"q": Peak() if network is None else network}, {"q": lagged})
 
 
-def sampled_advantage(batch: Batch, given: Context) -> Tensor:
-    return advantages(batch, judged(batch, given), 1.0, given)
+def settings(**given: Any) -> CorrMcSettings:
+    plain: dict[str, Any] = {"anneal": 0.5, "centred": False, "look_in_mirror": False}
+    return CorrMcSettings(**plain | given)
+
+
+def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> Judged:
+    return judged(batch, given, chosen, seeded("tests/draws"))
+
+
+def sampled_advantage(batch: Batch, given: Networks, chosen: CorrMcSettings) -> Tensor:
+    return advantages(batch, seen_by(batch, given, chosen), 1.0, chosen)
+
+
+def corrected(batch: Batch, given: Networks, chosen: CorrMcSettings, progress: float = 1.0) -> Tensor:
+    return target(batch, given, chosen, seeded("tests/draws"), progress)
 
 
 def episodes(mask: Tensor = MASK) -> Batch:
@@ -63,9 +85,9 @@ def episodes(mask: Tensor = MASK) -> Batch:
 
 def test_advantages_are_against_the_best_of_the_candidates_and_the_logged_action() -> None:
     lagged, batch = Peak(), episodes()
-    advantage = sampled_advantage(batch, context(lagged))
+    advantage = sampled_advantage(batch, networks(lagged), settings())
     generator = seeded("tests/draws")
-    by_step = torch.stack([uniform_actions(generator, batch=3)[..., 0].abs().amin(1) for _ in range(3)], dim=1)
+    by_step = torch.stack([uniform_actions(generator, 3, 16, 4)[..., 0].abs().amin(1) for _ in range(3)], dim=1)
     drawn = torch.stack([by_step[0, 1], by_step[0, 2], by_step[2, 1]])
     logged = torch.stack([batch.action[0, 1, 0], batch.action[0, 2, 0], batch.action[2, 1, 0]]).abs()
     expected = torch.minimum(logged, drawn) - logged
@@ -77,25 +99,26 @@ def test_advantages_are_against_the_best_of_the_candidates_and_the_logged_action
 
 def test_both_trunks_run_once_for_each_state_that_is_read() -> None:
     lagged, network = Peak(), Peak()
-    corrected_target(episodes(), context(lagged, network))
+    corrected(episodes(), networks(lagged, network), settings())
     assert [step.tolist() for step in lagged.states] == [step.tolist() for step in network.states] == [[1, 2, 1]]
 
 
 def test_the_target_is_the_papers_sum_and_the_observed_return_at_the_start_of_training() -> None:
     batch = episodes()
-    a = sampled_advantage(batch, context(Peak()))
-    corrected = corrected_target(batch, context(Peak()))
+    a = sampled_advantage(batch, networks(Peak()), settings())
+    found = corrected(batch, networks(Peak()), settings())
     first = 1 + 0.9 * (2 - a[0, 1]) + 0.81 * (3 - a[0, 2])
-    torch.testing.assert_close(corrected[0], torch.stack([first, 2 + 0.9 * (3 - a[0, 2]), torch.tensor(3.0)]))
+    torch.testing.assert_close(found[0], torch.stack([first, 2 + 0.9 * (3 - a[0, 2]), torch.tensor(3.0)]))
     observed = torch.tensor([[1 + 0.9 * 2 + 0.81 * 3, 2 + 0.9 * 3, 3], [1, 0, 0], [1 + 0.9 * 2, 2, 0]])
     for centred in (False, True):
-        torch.testing.assert_close(corrected_target(batch, context(Peak(), progress=0.0, centred=centred)), observed)
+        start = corrected(batch, networks(Peak()), settings(centred=centred), progress=0.0)
+        torch.testing.assert_close(start, observed)
 
 
 def test_episodes_of_one_step_need_no_network() -> None:
     lagged = Peak()
     batch = episodes(torch.ones(2, 1, dtype=torch.bool))
-    assert torch.equal(corrected_target(batch, context(lagged)), batch.reward)
+    assert torch.equal(corrected(batch, networks(lagged), settings()), batch.reward)
     assert lagged.states == []
 
 
@@ -123,10 +146,10 @@ def test_in_the_mirror_a_symmetric_q_picks_the_same_and_a_network_that_knows_no_
 
     batch = episodes()
     batch.image[:, :, :, 0] = 1
-    plain = judged(batch, context(Side(), Side()))
-    mirrored = judged(batch, context(Side(), Side(), mirror=True))
+    plain = seen_by(batch, networks(Side(), Side()), settings())
+    mirrored = seen_by(batch, networks(Side(), Side()), settings(look_in_mirror=True))
     torch.testing.assert_close(mirrored.value, plain.value, equal_nan=True)
-    other = judged(batch, context(Side(), Blind(), mirror=True))
+    other = seen_by(batch, networks(Side(), Blind()), settings(look_in_mirror=True))
     # It picks the candidate that is the worst here; then the logged action is at least as good.
     assert torch.equal(other.value[MASK][[1, 2, 5]], other.q[MASK][[1, 2, 5]])
     assert bool((plain.value > other.value)[MASK][[1, 2, 5]].any())
@@ -146,8 +169,8 @@ def test_the_best_of_noisy_values_is_judged_too_high_by_what_order_statistics_sa
     another network, by that of two, the pick and the logged action, where these are two.
     """
     batch = episodes(torch.ones(4000, 6, dtype=torch.bool))
-    given = context(Peak(deviation=0.1), Peak(deviation=0.1, seed=picker), candidates=values - 1)
-    bias = -float(sampled_advantage(batch, given)[:, 1:].mean()) / 0.1
+    given = networks(Peak(deviation=0.1), Peak(deviation=0.1, seed=picker))
+    bias = -float(sampled_advantage(batch, given, settings(candidates=values - 1))[:, 1:].mean()) / 0.1
     assert bias == pytest.approx(expected, abs=0.02)
 
 
@@ -162,17 +185,16 @@ def judged_at_random(mask: Tensor) -> Judged:
 def test_centred_targets_are_on_average_those_of_bootstrapping_and_keep_the_differences_between_episodes() -> None:
     mask = torch.arange(5) < torch.tensor([[5], [4], [4], [2], [1]])
     batch, seen = episodes(mask), judged_at_random(mask)
-    given = context(Peak(), centred=True)
-    shifted = advantages(batch, seen, 1.0, given)
-    target = corrected_episode_value(batch.reward, shifted, 1.0, 0.9, mask)
+    shifted = advantages(batch, seen, 1.0, settings(centred=True))
+    wanted = corrected_episode_value(batch.reward, shifted, 1.0, 0.9, mask)
     plain = corrected_episode_value(batch.reward, seen.q - seen.value, 1.0, 0.9, mask)
     for t in range(4):
         going_on = mask[:, t + 1]
         bootstrapped = (batch.reward[:, t] + 0.9 * seen.value[:, t + 1])[going_on]
-        assert float(target[:, t][going_on].mean()) == pytest.approx(float(bootstrapped.mean()), abs=1e-5)
+        assert float(wanted[:, t][going_on].mean()) == pytest.approx(float(bootstrapped.mean()), abs=1e-5)
     same_length = [1, 2]
     difference = (plain[same_length[0]] - plain[same_length[1]])[:4]
-    torch.testing.assert_close((target[same_length[0]] - target[same_length[1]])[:4], difference)
+    torch.testing.assert_close((wanted[same_length[0]] - wanted[same_length[1]])[:4], difference)
     shift = (shifted - (seen.q - seen.value))[mask & (torch.arange(5) > 0)]
     assert bool(shift.isfinite().all()) and float(shift.abs().max()) > 0.1
 
@@ -182,14 +204,12 @@ def test_centring_changes_nothing_where_the_lagged_network_is_right_on_average()
     batch, seen = episodes(mask), judged_at_random(mask)
     q = seen.q
     for t in (3, 2, 1):  # Later targets first: those before depend on them.
-        target = corrected_episode_value(batch.reward, q - seen.value, 0.7, 0.9, mask)
+        wanted = corrected_episode_value(batch.reward, q - seen.value, 0.7, 0.9, mask)
         q = q.clone()
-        q[:, t] += (target - q)[:, t][mask[:, t]].mean()
+        q[:, t] += (wanted - q)[:, t][mask[:, t]].mean()
     right = Judged(seen.value, q)
     plain = q - seen.value
-    torch.testing.assert_close(
-        centred_advantage(batch, right, 0.7, context(Peak())), plain, equal_nan=True, rtol=0, atol=1e-6
-    )
+    torch.testing.assert_close(centred_advantage(batch, right, 0.7, 0.9), plain, equal_nan=True, rtol=0, atol=1e-6)
 
 
 def test_cross_entropy_takes_targets_outside_zero_and_one_and_clipping_them_would_bring_bias() -> None:
@@ -203,7 +223,7 @@ def test_cross_entropy_takes_targets_outside_zero_and_one_and_clipping_them_woul
     assert best_q(targets) == pytest.approx(0.55, abs=5e-5)
     assert best_q(targets.clamp(0, 1)) == pytest.approx(0.4875, abs=5e-5)
     output = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    for target in (1.5, -0.25):
-        (slope,) = torch.autograd.grad(cross_entropy(output, torch.tensor(target, dtype=torch.float64)), output)
+    for value in (1.5, -0.25):
+        (slope,) = torch.autograd.grad(cross_entropy(output, torch.tensor(value, dtype=torch.float64)), output)
         # Linear in the target, whatever the target is.
-        assert float(slope) == pytest.approx(float(output.detach().sigmoid()) - target, abs=1e-12)
+        assert float(slope) == pytest.approx(float(output.detach().sigmoid()) - value, abs=1e-12)

@@ -3,28 +3,29 @@
 That `pcl` reaches the regularised optimum of a known decision process stands in `test_learning`.
 """
 
-import dataclasses
 import math
+from typing import Any
 
 import pytest
 import torch
-from plain_context import plain_context
+from plain import ACTION, plain_networks
 from torch import Tensor, nn
 
 from graspq.train.batch import Batch
 from graspq.train.estimators import ESTIMATORS
-from graspq.train.networks import StateNetwork
-from graspq.train.pcl import (
+from graspq.train.estimators.pcl import (
     Gaussian,
-    consistent_value,
+    PclSettings,
     log_density,
     path_consistency,
     policy_of,
     relative_entropy,
     residual,
+    target,
     tuned,
 )
-from graspq.train.state import Context, TrainState, seeded
+from graspq.train.networks.network import StateNetwork
+from graspq.train.state import Networks, TrainState, seeded
 from graspq.train.targets import corrected_episode_value, discounted_return, path_consistent
 
 
@@ -47,10 +48,10 @@ def test_densities_and_relative_entropies_are_torchs_own() -> None:
 
 
 def test_a_policy_starts_straight_down_and_no_output_takes_its_deviation_out_of_bounds() -> None:
-    policy = policy_of(torch.zeros(1, 8))
+    policy = policy_of(torch.zeros(1, 8), ACTION)
     torch.testing.assert_close(policy.mean, torch.tensor([[0.0, 0.0, -1.0, 0.0]]))
     torch.testing.assert_close(policy.log_deviation.exp(), torch.full((1, 4), 0.5))
-    narrow, wide = policy_of(torch.full((1, 8), -1e6)), policy_of(torch.full((1, 8), 1e6))
+    narrow, wide = policy_of(torch.full((1, 8), -1e6), ACTION), policy_of(torch.full((1, 8), 1e6), ACTION)
     torch.testing.assert_close(narrow.log_deviation.exp(), torch.full((1, 4), 0.1))
     torch.testing.assert_close(wide.log_deviation.exp(), torch.full((1, 4), 1.0))
     far = log_density(narrow, torch.ones(1, 4)) - log_density(wide, torch.ones(1, 4))
@@ -114,14 +115,16 @@ class Outputs(StateNetwork):
         return self.table[step]
 
 
-def context(actor: Tensor, lagged: Tensor, value: Tensor, penalty: float | None) -> Context:
-    return plain_context(
+def networks_of(actor: Tensor, lagged: Tensor, value: Tensor) -> Networks:
+    return plain_networks(
         {"actor": Outputs(actor), "v": Outputs(value)},
         {"actor": Outputs(lagged), "v": Outputs(value)},
-        loss="cross-entropy",
-        extra={"penalty": torch.tensor(0.25)},
-        penalty=penalty,
+        kept={"penalty": torch.tensor(0.25)},
     )
+
+
+def arguments(batch: Batch, given: Networks, settings: PclSettings) -> tuple[Any, ...]:
+    return batch, given, settings, seeded("tests/draws"), 0.0
 
 
 def episodes(action: Tensor, reward: Tensor, mask: Tensor | None = None) -> Batch:
@@ -145,31 +148,32 @@ def test_the_loss_is_half_the_mean_squared_residual_of_real_steps_with_the_given
 ) -> None:
     actor, lagged, value = numbers(4, 8, seed=1).float(), numbers(4, 8, seed=2).float(), numbers(4, 1, seed=3).float()
     action, reward = numbers(2, 4, 4, seed=4).float(), numbers(2, 4, seed=5).float()
-    batch, given = episodes(action, reward, MASK), context(actor, lagged, value, penalty)
-    ratio = log_density(policy_of(actor), action) - log_density(policy_of(lagged), action)
+    given = arguments(episodes(action, reward, MASK), networks_of(actor, lagged, value), PclSettings(penalty=penalty))
+    ratio = log_density(policy_of(actor, ACTION), action) - log_density(policy_of(lagged, ACTION), action)
     v = value.squeeze(-1).expand(2, -1)
-    target = path_consistent(reward, v, ratio, penalty or 0.25, 0.9, None, MASK)
-    torch.testing.assert_close(consistent_value(batch, given), target)
-    expected = 0.5 * (v - target)[MASK].square().mean()
-    torch.testing.assert_close(residual(batch, ESTIMATORS["pcl"], given), expected)
+    wanted = path_consistent(reward, v, ratio, penalty or 0.25, 0.9, None, MASK)
+    torch.testing.assert_close(target(*given), wanted)
+    expected = 0.5 * (v - wanted)[MASK].square().mean()
+    torch.testing.assert_close(residual(ESTIMATORS["pcl"], *given), expected)
 
 
 def test_the_gradient_flows_through_the_value_at_both_ends_of_a_path_and_through_the_policy() -> None:
     actor, lagged, value = numbers(4, 8, seed=1).float(), numbers(4, 8, seed=2).float(), numbers(4, 1, seed=3).float()
     action, reward = numbers(2, 4, 4, seed=4).float(), numbers(2, 4, seed=5).float()
     batch, penalty, discount, real = episodes(action, reward, MASK), 2.0, 0.9, int(MASK.sum())
-    given = dataclasses.replace(context(actor, lagged, value, penalty), path_steps=1)
-    residual(batch, ESTIMATORS["pcl"], given).backward()
-    delta = (value.squeeze(-1) - consistent_value(batch, given).detach()) * MASK
+    networks = networks_of(actor, lagged, value)
+    given = arguments(batch, networks, PclSettings(penalty=penalty, path_steps=1))
+    residual(ESTIMATORS["pcl"], *given).backward()
+    delta = (value.squeeze(-1) - target(*given).detach()) * MASK
     # ∂ mean ½ δ² / ∂ V(s_t) = mean δ_t - γ δ_{t-1} where there is a step t;  by π: mean λ δ_t ∂ log π(a_t|s_t)
     by_value = delta.clone()
     by_value[:, 1:] -= discount * delta[:, :-1] * MASK[:, 1:]
-    torch.testing.assert_close(given.networks["v"].table.grad.squeeze(-1), by_value.sum(0) / real)
+    torch.testing.assert_close(networks.online["v"].table.grad.squeeze(-1), by_value.sum(0) / real)
     outputs = actor.clone().requires_grad_()
-    log_policy = log_density(policy_of(outputs), action)
+    log_policy = log_density(policy_of(outputs, ACTION), action)
     (by_policy,) = torch.autograd.grad((penalty * delta * log_policy).sum() / real, outputs)
-    torch.testing.assert_close(given.networks["actor"].table.grad, by_policy)
-    assert float(by_policy.abs().min()) > 1e-4 and given.lagged_networks["actor"].table.grad is None
+    torch.testing.assert_close(networks.online["actor"].table.grad, by_policy)
+    assert float(by_policy.abs().min()) > 1e-4 and networks.lagged["actor"].table.grad is None
 
 
 @pytest.mark.parametrize("penalty", [None, 2.0])
@@ -178,15 +182,16 @@ def test_a_step_tunes_the_penalty_by_the_divergence_at_its_real_states_unless_it
 ) -> None:
     actor, lagged, value = numbers(4, 8, seed=1).float(), numbers(4, 8, seed=2).float(), numbers(4, 1, seed=3).float()
     batch = episodes(numbers(2, 4, 4, seed=4).float(), numbers(2, 4, seed=5).float(), MASK)
-    first, second = (torch.distributions.Normal(p.mean, p.log_deviation.exp()) for p in map(policy_of, (actor, lagged)))
+    policies = [policy_of(output, ACTION) for output in (actor, lagged)]
+    first, second = (torch.distributions.Normal(p.mean, p.log_deviation.exp()) for p in policies)
     by_step = torch.distributions.kl_divergence(first, second).sum(-1)
     divergence = float(by_step.expand(2, -1)[MASK].mean())
     assert divergence > 0.05 and abs(divergence - float(by_step.mean())) > 0.005
     # Between 0 and twice the bound, where the step is not clipped.
-    given = dataclasses.replace(context(actor, lagged, value, penalty), kl_bound=divergence / 1.3)
-    path_consistency(state_of(given), batch, ESTIMATORS["pcl"], given)
+    networks, settings = networks_of(actor, lagged, value), PclSettings(penalty=penalty, kl_bound=divergence / 1.3)
+    path_consistency(ESTIMATORS["pcl"], state_of(networks), batch, settings, seeded("tests/draws"), 0.0)
     expected = 0.25 * math.exp(0.02 * 0.3) if penalty is None else 0.25
-    assert float(given.extra["penalty"]) == pytest.approx(expected, rel=1e-6)
+    assert float(networks.kept["penalty"]) == pytest.approx(expected, rel=1e-6)
 
 
 def test_on_a_quadratic_reward_it_vanishes_at_the_policy_times_exp_of_reward_over_the_penalty() -> None:
@@ -231,45 +236,44 @@ class Normalised(StateNetwork):
 
 @pytest.mark.parametrize(("states", "mean"), [(100, 49.5), (300, 148.0)])  # all; 0, 4, 8, .. 296
 def test_evenly_spread_states_give_the_statistics_that_both_policies_use(states: int, mean: float) -> None:
-    networks = [Normalised() for _ in range(2)]
-    networks[1].load_state_dict(networks[0].state_dict())
-    networks[1].eval()
-    given = context(torch.zeros(1, 8), torch.zeros(1, 8), torch.zeros(states, 1), None)
-    given.networks["actor"], given.lagged_networks["actor"] = networks
-    state = state_of(given)
-    path_consistency(state, episodes(torch.zeros(1, states, 4), torch.zeros(1, states)), ESTIMATORS["pcl"], given)
-    for network in networks:
+    actors = [Normalised() for _ in range(2)]
+    actors[1].load_state_dict(actors[0].state_dict())
+    actors[1].eval()
+    value = Outputs(torch.zeros(states, 1))
+    kept = {"penalty": torch.tensor(0.25)}
+    networks = plain_networks({"actor": actors[0], "v": value}, {"actor": actors[1], "v": value}, kept=kept)
+    batch = episodes(torch.zeros(1, states, 4), torch.zeros(1, states))
+    path_consistency(ESTIMATORS["pcl"], state_of(networks), batch, PclSettings(), seeded("tests/draws"), 0.0)
+    for network in actors:
         assert float(network.norm.running_mean) == pytest.approx(mean)
     # Two policies of equal weights did not differ: neither used the batch's own statistics.
-    assert float(given.extra["penalty"]) == pytest.approx(0.25 * math.exp(-0.02), rel=1e-3)
+    assert float(networks.kept["penalty"]) == pytest.approx(0.25 * math.exp(-0.02), rel=1e-3)
 
 
-def state_of(given: Context) -> TrainState:
-    """Return a training's state with a context's networks."""
-    weights = {part: network.parameters() for part, network in given.networks.items()}
-    return TrainState(
-        step=0,
-        learned=given.networks,
-        lagged=given.lagged_networks,
-        averaged={},
-        optimizers={part: torch.optim.AdamW(weights[part], lr=0.05, weight_decay=0.0) for part in weights},
-        extra=given.extra,
-        parts={"v": 1, "actor": 8},
-    )
+def state_of(networks: Networks) -> TrainState:
+    """Return a training's state with these networks."""
+    optimizers = {
+        part: torch.optim.AdamW(network.parameters(), lr=0.05, weight_decay=0.0)
+        for part, network in networks.online.items()
+    }
+    return TrainState(step=0, networks=networks, averaged={}, optimizers=optimizers)
 
 
 def trained(action: Tensor, reward: Tensor, value: float, periods: int) -> tuple[Gaussian, list[float]]:
     """Train one state's policy from a V for periods of 20 steps between lagged copies; return it and all losses."""
-    given = context(torch.zeros(1, 8), torch.zeros(1, 8), torch.full((1, 1), value), 0.3)
-    state = state_of(given)
+    networks = networks_of(torch.zeros(1, 8), torch.zeros(1, 8), torch.full((1, 1), value))
+    state, settings = state_of(networks), PclSettings(penalty=0.3, actor_rate=1.0)
     losses = []
     for step in range(20 * periods):
         if step % 20 == 0:
-            state.lagged["actor"].load_state_dict(state.learned["actor"].state_dict())
+            networks.lagged["actor"].load_state_dict(networks.online["actor"].state_dict())
+        for part in state.optimizers:
+            state.set_rate(part, 0.05)  # as the loop does before each update
         batch = episodes(action.unsqueeze(1), reward.unsqueeze(1))
-        losses.append(float(path_consistency(state, batch, ESTIMATORS["pcl"], given)))
+        measured = path_consistency(ESTIMATORS["pcl"], state, batch, settings, seeded("tests/draws"), 0.0)
+        losses.append(float(measured["loss"]))
     with torch.no_grad():
-        return policy_of(state.learned["actor"](batch.image[:1, 0], batch.step[:1, 0])), losses
+        return policy_of(networks.online["actor"](batch.image[:1, 0], batch.step[:1, 0]), ACTION), losses
 
 
 def descending_data() -> Tensor:

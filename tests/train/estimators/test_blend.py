@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import tiny_mdp
 import torch
-from tiny_training import COARSE, context, fit, q_on_grid, tiny_networks
+from tiny_training import COARSE, fit, q_on_grid, tiny_networks, tiny_settings
 from torch import Tensor
 
-from graspq.train.blend import BINS, DECAY, blended, cell_of, summed, weights
 from graspq.train.estimators import ESTIMATORS
-from graspq.train.settings import TrainSettings, preset_settings
+from graspq.train.estimators.blend import BINS, DECAY, cell_of, summed, weights
+from graspq.train.settings import TrainSettings
 from graspq.train.state import TrainState, seeded
-from graspq.train.targets import bootstrapped, corrected_episode_value
+from graspq.train.targets import blended, bootstrapped, corrected_episode_value
 
 DISCOUNT = 0.9
 
@@ -104,17 +104,15 @@ def networks() -> Iterator[None]:
 
 def settings(**given: Any) -> TrainSettings:
     short: dict[str, Any] = {
-        "algo": "blend",
-        "shards": ("none",),
         "batch_size": 128,
         "learning_rate": 3e-3,
         "weight_decay": 0.0,
     }
-    return preset_settings("default", **short | {"average_decay": 0.95} | given)
+    return tiny_settings(**short | {"average_decay": 0.95} | given)
 
 
 def learned(algo: str, data: tiny_mdp.Data, **given: Any) -> TrainState:
-    return fit(ESTIMATORS[algo], data, settings(**given))
+    return fit(ESTIMATORS[algo], data, settings(algo=algo, **given))
 
 
 def error(state: TrainState) -> float:
@@ -125,8 +123,8 @@ def error(state: TrainState) -> float:
 
 def mean_weight(state: TrainState) -> float:
     """Return λ, averaged over the steps that were seen of late."""
-    count = state.extra["blend_errors"][0]
-    return float((weights(state.extra) * count).sum() / count.sum())
+    count = state.networks.kept["blend_errors"][0]
+    return float((weights(state.networks.kept) * count).sum() / count.sum())
 
 
 def compared(episodes: int, steps: int, seeds: tuple[int, ...]) -> tuple[dict[str, float], float]:
@@ -169,11 +167,11 @@ def test_the_weight_is_high_while_q_is_wrong_and_falls_as_it_becomes_right() -> 
 def test_validation_leaves_what_was_measured_as_it_is() -> None:
     data = tiny_mdp.collect(50, 0)
     state = learned("blend", data, steps=3)
-    before = {name: tensor.clone() for name, tensor in state.extra.items()}
+    before = {name: tensor.clone() for name, tensor in state.networks.kept.items()}
     rows = torch.arange(50)
-    judged = context(state, settings(), seeded("tests/blend/validation"))
+    row, own, random = ESTIMATORS["blend"], settings(algo="blend").own, seeded("tests/blend/validation")
     with torch.no_grad():
-        loss = ESTIMATORS["blend"].objective(data.whole_episodes(rows), ESTIMATORS["blend"], judged)
+        loss = row.objective(row, data.whole_episodes(rows), state.networks, own, random, 0.5)
     assert float(loss) > 0
-    assert all(torch.equal(before[name], tensor) for name, tensor in state.extra.items())
+    assert all(torch.equal(before[name], tensor) for name, tensor in state.networks.kept.items())
     assert before["blend_errors"][0].sum() > 0

@@ -9,18 +9,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from plain_context import plain_context
+from plain import ACTION, plain_networks
 from torch import Tensor, nn
 
 from graspq.train.batch import Batch
 from graspq.train.checkpoint import load_acting
-from graspq.train.ddpg import lagged_actor_target, uphill
-from graspq.train.distributed import WHOLE
+from graspq.train.estimators.ddpg import DdpgSettings, target, uphill
 from graspq.train.loop import train
-from graspq.train.networks import Features, QNetwork, StateNetwork
+from graspq.train.networks.network import Features, QNetwork, StateNetwork
 from graspq.train.selection import pointed
 from graspq.train.settings import TrainSettings
-from graspq.train.updates import descend
+from graspq.train.state import seeded
 
 
 class Says(StateNetwork):
@@ -69,19 +68,19 @@ def batch(**changes: Tensor | None) -> Batch:
 
 
 def test_an_output_of_zero_points_straight_down_and_no_output_points_far_outside_the_box() -> None:
-    torch.testing.assert_close(pointed(torch.zeros(1, 4)), torch.tensor([[0.0, 0.0, -1.0, 0.0]]))
-    assert float(pointed(torch.full((1, 4), 1e6)).abs().max()) < 1.25001
+    torch.testing.assert_close(pointed(torch.zeros(1, 4), ACTION), torch.tensor([[0.0, 0.0, -1.0, 0.0]]))
+    assert float(pointed(torch.full((1, 4), 1e6), ACTION).abs().max()) < 1.25001
 
 
 def test_the_target_judges_the_lagged_actors_action_by_the_lagged_critic_and_clips_it() -> None:
-    context = plain_context(
+    networks = plain_networks(
         {"q": Product(-50.0), "actor": Says(-0.5, 0.0, 0.0, 0.0)},
         {"q": Product(2.0), "actor": Says(1.2, 0.0, 0.0, 0.0)},
     )
-    target = lagged_actor_target(batch(), context)
-    torch.testing.assert_close(target, torch.tensor([[0.9 * (2.0 + 1.0)], [1.0]]))
+    found = target(batch(), networks, DdpgSettings(), seeded("tests/draws"), 0.0)
+    torch.testing.assert_close(found, torch.tensor([[0.9 * (2.0 + 1.0)], [1.0]]))
     with pytest.raises(ValueError, match="next_image"):
-        lagged_actor_target(batch(next_image=None), context)
+        target(batch(next_image=None), networks, DdpgSettings(), seeded("tests/draws"), 0.0)
 
 
 def test_the_gradient_is_the_slope_of_q_clipped_and_turns_back_beyond_the_bounds_of_the_box() -> None:
@@ -115,19 +114,20 @@ def test_the_critics_weights_change_by_its_own_regression_alone(
 def test_the_actor_rests_for_its_part_of_the_steps_and_then_moves(
     settings: Callable[..., TrainSettings], tmp_path: Path
 ) -> None:
-    short = {"preset": "paper", "steps": 4, "checkpoint_every": 1, "keep_checkpoints": 4}
-    run = train(settings("ddpg", out=tmp_path / "run", actor_rest=0.5, **short)).folder
+    short = {"preset": "paper", "steps": 4, "save_every": 1}
+    run = train(settings("ddpg", out=tmp_path / "run", actor_rest=0.5, **short), stop_at=3).folder
     actors = [load_acting(run, step).networks["actor"].state_dict() for step in (1, 2, 3)]
     same = [all(torch.equal(actors[0][name], other[name]) for name in other) for other in actors[1:]]
     assert same == [True, False]
 
 
 def test_the_actor_takes_a_step_after_as_many_steps_of_q_as_it_is_told(
-    settings: Callable[..., TrainSettings], tmp_path: Path
+    settings: Callable[..., TrainSettings],
 ) -> None:
-    short = {"preset": "paper", "steps": 5, "checkpoint_every": 1, "keep_checkpoints": 5}
-    run = train(settings("ddpg", out=tmp_path / "run", actor_rest=0.0, actor_every=2, **short)).folder
-    states = [load_acting(run, step).networks for step in (1, 2, 3, 4)]
+    chosen = settings("ddpg", preset="paper", steps=5, save_every=1, actor_rest=0.0, actor_every=2)
+    states = []
+    for step in (1, 2, 3, 4):
+        states.append(load_acting(train(chosen, stop_at=step).folder, step).networks)
     changed = {
         part: [
             any(
@@ -149,9 +149,11 @@ def test_an_actor_that_follows_the_gradient_ends_at_the_top_or_at_the_bound_befo
     optimizer = torch.optim.AdamW(actor.parameters(), lr=0.01, weight_decay=0.0)
     image, step = torch.zeros(3, 8, 8, 3, dtype=torch.uint8), torch.zeros(3, dtype=torch.int64)
     for _ in range(400):
-        direction = pointed(actor(image, step))
+        direction = pointed(actor(image, step), ACTION)
         gradient = uphill(lambda action: -(action[..., 0] - top).square(), direction.detach())
-        descend(optimizer, -(gradient * direction).sum(-1).mean(), WHOLE)
-    action = pointed(actor(image, step)).clamp(-1, 1)
+        optimizer.zero_grad()
+        (-(gradient * direction).sum(-1).mean()).backward()
+        optimizer.step()
+    action = pointed(actor(image, step), ACTION).clamp(-1, 1)
     torch.testing.assert_close(action, torch.tensor([[reached, 0.0, -1.0, 0.0]]).expand(3, -1), rtol=0, atol=1e-3)
     assert float(direction.detach().abs().max()) < 1.25

@@ -13,10 +13,10 @@ from graspq.datasets.dataset import open_shards
 from graspq.datasets.pool import ShardPool
 from graspq.train.checkpoint import load_acting
 from graspq.train.estimators import ESTIMATORS
+from graspq.train.estimators.supervised import SearchOfMotions, SupervisedSettings, measured_motions, motions_at
 from graspq.train.loop import train
 from graspq.train.selection import SearchSpace
 from graspq.train.settings import TrainSettings
-from graspq.train.supervised import measured_motions, motions_at
 
 
 def motions_of(pool: ShardPool, step: int) -> np.ndarray:
@@ -27,7 +27,7 @@ def motions_of(pool: ShardPool, step: int) -> np.ndarray:
 
 def test_the_motions_of_each_step_are_measured_and_steps_never_seen_take_the_last_seen_ones(dataset: Path) -> None:
     pool = open_shards([dataset])
-    extra = measured_motions(pool)
+    extra = measured_motions(pool, SupervisedSettings())
     assert {name: list(tensor.shape) for name, tensor in extra.items()} == {
         f"synthetic_{name}": [15, 4] for name in SearchSpace._fields
     }
@@ -45,7 +45,7 @@ def test_the_motions_of_each_step_are_measured_and_steps_never_seen_take_the_las
 def test_a_motion_seen_once_gives_numbers_and_no_nan(dataset: Path) -> None:
     pool = open_shards([dataset])
     few = dataclasses.replace(pool, blocks=pool.blocks[:1])
-    assert all(bool(tensor.isfinite().all()) for tensor in measured_motions(few).values())
+    assert all(bool(tensor.isfinite().all()) for tensor in measured_motions(few, SupervisedSettings()).values())
 
 
 def test_a_search_gets_the_row_of_its_step_and_the_last_row_after_it() -> None:
@@ -61,8 +61,8 @@ def test_the_box_is_of_the_training_part_alone_and_lies_in_the_checkpoint(
     chosen = settings("supervised", steps=2, validation_fraction=0.5)
     run = train(chosen)
     training, _ = open_shards(chosen.shards).split(0.5, chosen.seed)
-    kept = load_acting(run.folder).extra
-    expected = measured_motions(training)
+    kept = load_acting(run.folder).kept
+    expected = measured_motions(training, SupervisedSettings())
     assert kept.keys() == expected.keys()
     assert all(torch.equal(kept[name], expected[name]) for name in expected)
 
@@ -71,18 +71,20 @@ def test_labels_are_outcomes_without_discount_whatever_the_datasets_discount_is(
     settings: Callable[..., TrainSettings],
     two_states: SimpleNamespace,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = two_states.dataset(tmp_path / "discounted", 30, discount=0.5)
-    run = train(settings("supervised", shards=(str(folder),), steps=2))
-    assert run.config["discount"] == 1.0 and "discount 1" in run.config["mc_return"]
-    assert "supervised: returns are made from the rewards with discount 1" in capsys.readouterr().err
-    pool = open_shards([folder]).with_discount(1.0)
-    returns = pool.read_block(pool.blocks[0]).records["mc_return"]
+    chosen, seen = settings("supervised", shards=(str(folder),), steps=2), []
+    row = ESTIMATORS["supervised"]
+    watching = dataclasses.replace(row.target_value, target=lambda batch, *_: seen.append(batch) or batch.mc_return)
+    monkeypatch.setitem(ESTIMATORS, "supervised", dataclasses.replace(row, target_value=watching))
+    train(chosen)
+    returns = torch.cat([batch.mc_return.flatten() for batch in seen])
     assert set(returns.tolist()) == {0.0, 1.0}
+    assert set(open_shards([folder]).read_block(open_shards([folder]).blocks[0]).records["mc_return"].tolist()) > {0.5}
 
 
 def test_the_row_regresses_on_synthetic_actions() -> None:
     row = ESTIMATORS["supervised"]
     batch = SimpleNamespace(action="logged", synthetic_action="synthetic")
-    assert row.action(batch) == "synthetic" and row.acting == "synthetic search"  # type: ignore[arg-type]
+    assert row.action(batch) == "synthetic" and isinstance(row.action_selection, SearchOfMotions)  # type: ignore[arg-type]
