@@ -171,5 +171,8 @@ def test_the_page_of_an_estimator_has_its_options_and_the_differences_that_its_c
 def test_tests_mirror_the_folders():
     for folder in MAY_IMPORT:
         modules = {name for path in sources(folder) for name in (path.stem, path.parent.name)}
-        for test in (ROOT / "tests" / folder).glob("test_*.py"):
-            assert test.stem.removeprefix("test_") in modules | {"mirror", "learning"}, test
+        for test in (ROOT / "tests" / folder).rglob("test_*.py"):
+            inside = test.parent.relative_to(ROOT / "tests")
+            assert (ROOT / inside).is_dir(), test
+            here = modules if inside == Path(folder) else {path.stem for path in sources(inside)}
+            assert test.stem.removeprefix("test_") in here | {"mirror", "learning"}, test

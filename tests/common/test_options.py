@@ -6,7 +6,18 @@ import click
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.common.options import Command, Group, Settings, options_from, parse_count, setting, with_version
+from graspq.common.options import (
+    Command,
+    Group,
+    Settings,
+    given_options,
+    options_from,
+    parameters,
+    parse_count,
+    setting,
+    shown_value,
+    with_version,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,3 +110,54 @@ def test_counts_are_written_with_k_and_m(text, count):
 def test_what_is_no_count_is_refused(text):
     with pytest.raises(ValueError, match="whole number of at least 1"):
         parse_count(text)
+
+
+@dataclasses.dataclass(frozen=True)
+class WithNone(Settings):
+    """Settings in which None is a value like any other, whose defaults somebody else decides."""
+
+    steps: int = setting(help="count", parse=parse_count)
+    penalty: float | None = setting(3.0, help="weight", minimum=0, none="tuned", source="the text, section 3")
+    mirror: bool = setting(True, help="mirror")
+    unsaid: int = 4
+
+
+SHOWN = {"penalty": "default: 3", "mirror": "default: --mirror", "steps": "default: 5"}
+
+
+def given(*words):
+    """Return which options of `WithNone` the command line gave."""
+    command = Command("example", params=parameters(WithNone, SHOWN))
+    with command.make_context("example", list(words)) as context:
+        return given_options(context)
+
+
+def test_only_what_was_said_is_given_and_none_that_was_said_is_a_value():
+    assert given() == {}
+    assert given("--penalty", "tuned") == {"penalty": None}
+    assert given("--penalty", "3") == {"penalty": 3.0}
+    assert given("--no-mirror", "--steps", "2k") == {"mirror": False, "steps": 2000}
+    assert given("--mirror") == {"mirror": True}
+
+
+def test_another_word_than_the_one_for_none_is_refused():
+    with pytest.raises(click.BadParameter, match="'none' is not a valid float"):
+        given("--penalty", "none")
+
+
+def test_the_help_has_the_word_for_none_the_source_and_what_decides_the_default():
+    command = Command("example", params=parameters(WithNone, SHOWN))
+    with command.make_context("example", []) as context:
+        shown = " ".join(command.get_help(context).split())
+    assert "--penalty FLOAT|tuned weight Source: the text, section 3. [default: 3]" in shown
+    assert "--mirror / --no-mirror mirror [default: --mirror]" in shown
+    assert "unsaid" not in shown, "a field without help is no option"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [("penalty", None, "tuned"), ("penalty", 0.25, "0.25"), ("mirror", False, "--no-mirror"), ("steps", 7, "7")],
+)
+def test_a_value_is_shown_as_the_command_line_takes_it(name, value, text):
+    fields = {field.name: field for field in dataclasses.fields(WithNone)}
+    assert shown_value(fields[name], value) == text
