@@ -85,7 +85,8 @@ def validate(
             rewards.append(batch.real(batch.reward)[last].cpu().numpy())
     if count == 0:
         return None
-    q = np.concatenate(scores).astype(np.float64) if scores else np.zeros(0)
+    # Where training diverged Q may be no number; the loss says so, and the loop stops.
+    q = np.nan_to_num(np.concatenate(scores).astype(np.float64)) if scores else np.zeros(0)
     reward = np.concatenate(rewards) if rewards else np.zeros(0, dtype=np.float32)
     rows, error = calibration(q, reward)
     return Validation(
