@@ -3,6 +3,7 @@
 Dimension key: B batch, T steps, A parts of an action, H W C image.
 """
 
+import functools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -165,4 +166,4 @@ class Grasps:
         """
         from graspq.datasets.torch_dataset import TorchDataset
 
-        return TorchDataset(self, batch_size, seed, view, options)
+        return TorchDataset(functools.partial(self.batches, batch_size, seed, view), options)
