@@ -28,7 +28,7 @@ def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_s
     dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--algo", "mc", "--learning-rate", "0.001", "1e30", "--width", "4", "--shards", str(dataset)]
-    words += ["--steps", "30", "--episodes", "2", "--workers", "2", "--threads", "1", "--device", "cpu"]
+    words += ["--steps", "600", "--episodes", "2", "--workers", "2", "--threads", "1", "--device", "cpu"]
     words += ["--out", str(tmp_path)]
     sweep = [str(Path(sys.executable).with_name("grasp-sweep")), *words]
 
@@ -53,14 +53,14 @@ def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_s
     assert ended.value.code == 1
     rows = {row["id"]: row for row in map(json.loads, (tmp_path / "sweep.jsonl").read_text().splitlines())}
     assert [(row["status"], row["steps"], row["episodes"]) for row in rows.values()] == [
-        ("done", 30, 2),
+        ("done", 600, 2),
         ("failed", 0, None),
     ]
     assert rows[DIVERGING]["reason"].startswith("mc diverged at step ")
     assert out.count("\n") == 4 and "failed: mc diverged" in out
     assert "[2/2] " in err and "step/s" not in err
     logged = [row["step"] for row in Run.open(tmp_path / "runs" / ID).metrics() if "loss" in row]
-    assert logged == sorted(set(logged)) and logged[-1] == 30
+    assert logged == sorted(set(logged)) and logged[-1] == 600
 
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*") if path.is_file()}
     with pytest.raises(SystemExit) as ended:
