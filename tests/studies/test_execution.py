@@ -32,7 +32,8 @@ def test_a_sweep_that_is_stopped_and_killed_goes_on_where_it_was_and_a_failure_s
     words += ["--out", str(tmp_path)]
     sweep = [str(Path(sys.executable).with_name("grasp-sweep")), *words]
 
-    process = subprocess.Popen(sweep)
+    # A shell that starts the tests in the background lets them ignore SIGINT, and what they start would too.
+    process = subprocess.Popen(sweep, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     wait_for(tmp_path / "logs" / f"{ID}.log", process)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=120) == 130
