@@ -66,6 +66,7 @@ def conservative_update(
     """Take one step: regression onto the double-Q target, and α (log mean exp output(random) - output(logged))."""
     networks = state.networks
     target = targets_of(row, batch, networks, settings, random, progress)
+    networks.q.train()
     metrics = loss_of(row, batch, target, networks, settings)
     logged = batch.real(batch.action)
     drawn = uniform_actions(random, len(logged), settings.candidates, logged.shape[-1]).to(logged.device)

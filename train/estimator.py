@@ -28,7 +28,11 @@ Metrics = dict[str, Tensor]
 
 @dataclasses.dataclass(frozen=True)
 class EstimatorSettings(Settings):
-    """Options of one estimator; they follow the common ones in `grasp-train --algo NAME --help`."""
+    """Options of one estimator; they follow the common ones in `grasp-train --algo NAME --help`.
+
+    Two names mean something to the loop: `discount` is that of the returns in a batch, and with `lag_steps` there are
+    lagged copies of the networks, which follow after so many steps.
+    """
 
     def chosen_discount(self, stored: float) -> float:
         """Return γ of the run's `mc_return`; `stored` is that of the dataset's own."""
@@ -48,14 +52,22 @@ class TargetValue(Generic[S]):
     Attributes:
         words: the paper's for it.
         target: see `Target`; called without gradient, all networks in evaluation mode.
-        view: what a batch holds: single transitions (T = 1), or whole episodes.
-        needs_next: whether the target reads s'.
+        view: what a batch holds: single transitions (T = 1), or whole episodes, of about `--batch-size` transitions.
+        needs_next: whether the target reads s'; in episodes that is the next step, where the mask is true.
+
+    Raises:
+        ValueError: s' is asked of episodes.
     """
 
     words: str
     target: Target[S]
     view: Literal["transitions", "episodes"] = "transitions"
     needs_next: bool = False
+
+    def __post_init__(self) -> None:
+        """Check that a batch can hold what the target reads."""
+        if self.needs_next and self.view == "episodes":
+            raise ValueError("needs_next: episodes hold s' as their next step; leave it out with view='episodes'")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +138,6 @@ def regression(
     θ ← θ - optimiser(∇_θ mean ℓ(Q_θ(s_t, a_t), y_t)),  y_t fixed
     """
     networks = state.networks
-    networks.q.eval()
     target = targets_of(row, batch, networks, settings, random, progress)
     networks.q.train()
     metrics = loss_of(row, batch, target, networks, settings)
@@ -178,7 +189,9 @@ class Estimator(Generic[S]):
 def targets_of(
     row: Estimator[S], batch: Batch, networks: Networks, settings: S, random: torch.Generator, progress: float
 ) -> Tensor:
-    """Return the estimator's target of every real step, float32 [n], without gradient."""
+    """Return the estimator's target of every real step, float32 [n], without gradient; leaves networks in eval mode."""
+    for network in networks.online.values():
+        network.eval()
     with torch.no_grad(), networks.autocast():
         return batch.real(row.target_value.target(batch, networks, settings, random, progress)).float()
 

@@ -155,6 +155,8 @@ def refuse_taken_names(row: Estimator[Any], network: str) -> None:
     Raises:
         UserError: they have.
     """
+    if not isinstance(row.paper, row.settings):
+        raise UserError(f"--algo: paper: expected {row.settings.__name__}, the row has {type(row.paper).__name__}")
     common, of_network = names_of(TrainSettings) | COMMAND_OPTIONS, network_named(network).settings
     for option, kind in (("--algo", row.settings), (f"--network {network}", of_network)):
         for name in sorted(names_of(kind) & common):
