@@ -28,7 +28,7 @@ class Arm:
         self.task = task
         self.client = world.client
         self.world = world
-        self.body = world.load_urdf(robot_model.panda_urdf(whole=world.gui), fixed=True)
+        self.body = world.load_urdf(robot_model.panda_urdf(), fixed=True)
         self.number = self.body.number
         self.fingers = robot_model.FINGER_LINKS
         # No shape of the arm touches another one; only hand and fingers have any.
@@ -120,6 +120,12 @@ class Arm:
         base = bullet.getJointState(self.number, 0, physicsClientId=self.client)[0]
         wrist = bullet.getJointState(self.number, 6, physicsClientId=self.client)[0]
         return np.array([*link[4], kinematics.wrist_turn(base, wrist)])
+
+    def link_poses(self) -> list[tuple[float, ...]]:
+        """Return the pose of each of `robot_model.visible_links`: position (metres) and quaternion (xyzw)."""
+        links = [visible.link for visible in robot_model.visible_links()]
+        states = bullet.getLinkStates(self.number, links, computeForwardKinematics=1, physicsClientId=self.client)
+        return [state[4] + state[5] for state in states]
 
     def finger_gap(self) -> float:
         """Return the distance between the pads, metres."""

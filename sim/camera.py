@@ -1,57 +1,55 @@
 """The fixed camera, on the symmetry plane y = 0 and opposite the robot, so that a mirrored picture is a valid picture.
 
-The light lies in the same plane; TinyRenderer draws, so the pixels do not depend on a graphics card.
+The light lies in the same plane.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 
-from graspq.sim.bullet import bullet
-from graspq.sim.world import World
+_SHADOW_BIAS = 0.002  # metres that something must be nearer to the light, or a face would shade itself
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A pinhole camera on the symmetry plane.
+    """A pinhole camera and a far light, both on the symmetry plane.
 
     Attributes:
-        target: point in the centre of the picture, metres in the world.
-        distance: from the target to the camera, metres.
-        pitch: degrees below the horizon, negative looks down.
-        field_of_view: degrees, vertical.
+        eye: where the camera is, metres in the world; its y is 0.
+        target: point in the centre of the picture, metres in the world; its y is 0.
+        half_view: half of the height and width that the picture shows of a plane at a distance of 1 m, metres.
+        nearest: faces nearer than this along the camera's axis are not drawn, metres.
         light: direction towards the light; its y is 0.
-        shadows: whether shadows are drawn; the gripper's shadow shows where it will land.
+        ambient: light that falls everywhere; a colour of 1 under a light of 1 is white.
+        diffuse: light that falls on a face that is turned to the light.
+        shaded: the share of `diffuse` that a shadow leaves; the gripper's shadow shows where it will land.
+        shadow_half: half width of the square of the floor, around `target`, on which shadows fall, metres.
     """
 
+    eye: tuple[float, float, float] = (0.97, 0.0, 0.8494)
     target: tuple[float, float, float] = (0.52, 0.0, 0.07)
-    distance: float = 0.9
-    pitch: float = -60.0
-    field_of_view: float = 28.0
+    half_view: float = 0.24933
+    nearest: float = 0.1
     light: tuple[float, float, float] = (0.35, 0.0, 1.0)
-    shadows: bool = True
+    ambient: float = 0.55
+    diffuse: float = 0.45
+    shaded: float = 0.5
+    shadow_half: float = 0.36
 
-    def render(self, world: World, size: int) -> np.ndarray:
-        """Return a picture, uint8 [size, size, 3] RGB; columns run along +y, rows towards the camera (+x)."""
-        view = bullet.computeViewMatrixFromYawPitchRoll(self.target, self.distance, 90.0, self.pitch, 0.0, 2)
-        projection = list(bullet.computeProjectionMatrixFOV(self.field_of_view, 1.0, 0.1, 3.0))
-        # TinyRenderer samples a pixel at its corner, which shifts the picture by half a pixel and would break its
-        # mirror symmetry: shift it back. Entry 8 multiplies the view's z, the negative of the clip space's w.
-        projection[8] += 1.0 / size
-        _, _, rgba, _, _ = bullet.getCameraImage(
-            size,
-            size,
-            view,
-            projection,
-            lightDirection=self.light,
-            lightColor=(1.0, 1.0, 1.0),
-            lightDistance=2.0,
-            lightAmbientCoeff=0.55,
-            lightDiffuseCoeff=0.45,
-            lightSpecularCoeff=0.0,
-            shadow=int(self.shadows),
-            renderer=bullet.ER_TINY_RENDERER,
-            flags=bullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=world.client,
+    def view(self) -> np.ndarray:
+        """Return what the rasteriser takes, float64 [11]; products and roots alone, which all machines agree on."""
+        fx, fz = _unit(self.target[0] - self.eye[0], self.target[2] - self.eye[2])
+        lx, lz = _unit(self.light[0], self.light[2])
+        centre = self.target[0] * lz - self.target[2] * lx
+        return np.array(
+            [
+                *(self.eye[0], self.eye[2], fx, fz, self.half_view, self.nearest),
+                *(lx, lz, centre, self.shadow_half, _SHADOW_BIAS),
+            ]
         )
-        return np.ascontiguousarray(np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)[:, :, :3])
+
+
+def _unit(x: float, z: float) -> tuple[float, float]:
+    length = math.sqrt(x * x + z * z)
+    return x / length, z / length

@@ -53,6 +53,7 @@ class Grasping(gymnasium.Env[dict[str, Any], np.ndarray], EzPickle):
         objects: str | Path | None = None,
         split: str = "train",
         render_mode: str | None = None,
+        depth_and_mask: bool = False,
     ) -> None:
         """Make the environment.
 
@@ -61,11 +62,12 @@ class Grasping(gymnasium.Env[dict[str, Any], np.ndarray], EzPickle):
             objects: folder of an object set; the project's own set by default.
             split: `train` or `test`; the targeted task also has `test-clutter`.
             render_mode: `rgb_array`, `human` (PyBullet's window) or None.
+            depth_and_mask: `info` holds `depth` and `mask` of the image, as `graspq.sim.observation` describes them.
 
         Raises:
             UserError: the task, the folder, the split or the render mode is not as expected.
         """
-        EzPickle.__init__(self, task, objects, split, render_mode)
+        EzPickle.__init__(self, task, objects, split, render_mode, depth_and_mask)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise UserError(f"render_mode {render_mode!r}: choose from rgb_array, human or None")
         if sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -84,7 +86,9 @@ class Grasping(gymnasium.Env[dict[str, Any], np.ndarray], EzPickle):
             }
         )
         self.action_space = spaces.Box(-1.0, 1.0, (self.task.action.size,), np.float32)
-        self.simulation = GraspSimulation(self.task, self.objects, gui=render_mode == "human")
+        self.simulation = GraspSimulation(
+            self.task, self.objects, gui=render_mode == "human", depth_and_mask=depth_and_mask
+        )
         self._episodes_in_bin = EPISODES_PER_BIN
 
     def reset(
@@ -124,7 +128,11 @@ class Grasping(gymnasium.Env[dict[str, Any], np.ndarray], EzPickle):
         return {"image": observation.image.copy(), "step": np.int64(observation.step)}
 
     def _info(self) -> dict[str, Any]:
-        return {"gripper_pose": self.simulation.observation.gripper_pose.copy()}
+        observation = self.simulation.observation
+        info = {"gripper_pose": observation.gripper_pose.copy()}
+        if observation.depth is not None and observation.mask is not None:
+            info |= {"depth": observation.depth.copy(), "mask": observation.mask.copy()}
+        return info
 
     def render(self) -> np.ndarray | None:
         """Return the camera's view, uint8 [256, 256, 3], in `rgb_array` mode; the window draws itself."""

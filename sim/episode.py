@@ -10,12 +10,14 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from graspq.objects.object_set import ObjectSet
-from graspq.sim import cell
+from graspq.sim import cell, robot_model
 from graspq.sim.arm import Arm
 from graspq.sim.camera import Camera
-from graspq.sim.observation import Observation
+from graspq.sim.observation import ARM, Observation
+from graspq.sim.renderer import Part, Renderer, box
 from graspq.sim.task import Task
 from graspq.sim.world import Body, World
 
@@ -47,10 +49,21 @@ class Outcome:
 class GraspSimulation:
     """A cell with its own physics client; close it, or use it in a `with` statement."""
 
-    def __init__(self, task: Task, objects: ObjectSet, *, gui: bool = False) -> None:
-        self.task, self.objects = task, objects
+    def __init__(self, task: Task, objects: ObjectSet, *, gui: bool = False, depth_and_mask: bool = False) -> None:
+        """Make an empty cell.
+
+        Args:
+            task: what to do.
+            objects: what it is done with.
+            gui: open PyBullet's window.
+            depth_and_mask: observations have both.
+        """
+        self.task, self.objects, self.with_depth_and_mask = task, objects, depth_and_mask
         settings = task.settings
-        self.camera = Camera()
+        self.renderer = Renderer(
+            Camera(), [box(*still) for still in (cell.table_box(settings), *cell.bin_boxes(settings))]
+        )
+        self._shapes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.world = World(time_step=settings.time_step, solver_iterations=settings.solver_iterations, gui=gui)
         self.object_ids: tuple[str, ...] = ()
         self.bodies: list[Body] = []
@@ -64,7 +77,16 @@ class GraspSimulation:
         self.arm = Arm(self.world, self.task.settings)
         self.object_ids = tuple(object_ids)
         self.bodies = cell.load_objects(self.world, self.task.settings, self.objects, object_ids)
+        arm = [Part(link.vertices, link.faces, link.color, ARM) for link in robot_model.visible_links()]
+        self.renderer.hold([*arm, *(self._part(object_id, place) for place, object_id in enumerate(object_ids))])
         self.terminated = True
+
+    def _part(self, object_id: str, place: int) -> Part:
+        """Return an object as the renderer draws it."""
+        if object_id not in self._shapes:
+            whole = trimesh.util.concatenate(list(self.objects.parts_of(object_id)))
+            self._shapes[object_id] = np.asarray(whole.vertices), np.asarray(whole.faces)
+        return Part(*self._shapes[object_id], self.objects[object_id].color, place)
 
     def reset(self, rng: np.random.Generator) -> Observation:
         """Drop the objects anew, home the arm and return the first observation."""
@@ -95,8 +117,10 @@ class GraspSimulation:
     def observation(self) -> Observation:
         """The current observation; rendered when first asked for."""
         if self._observation is None:
-            image = self.camera.render(self.world, self.task.settings.image_size)
-            self._observation = Observation(image, self.step_count, self.arm.pose().astype(np.float32))
+            size = self.task.settings.image_size
+            depth, mask = self.depth_and_mask(size) if self.with_depth_and_mask else (None, None)
+            pose = self.arm.pose().astype(np.float32)
+            self._observation = Observation(self.render(size), self.step_count, pose, depth, mask)
         return self._observation
 
     def object_poses(self) -> np.ndarray:
@@ -161,7 +185,16 @@ class GraspSimulation:
 
     def render(self, size: int) -> np.ndarray:
         """Return the camera's view at another resolution, uint8 [size, size, 3]."""
-        return self.camera.render(self.world, size)
+        return self.renderer.image(self._poses(), size)
+
+    def depth_and_mask(self, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return depth, float32 [size, size], and mask, int32 [size, size]; see `Observation`."""
+        return self.renderer.depth_and_mask(self._poses(), size)
+
+    def _poses(self) -> np.ndarray:
+        """Return the poses of what the renderer holds, float64 [P, 7]."""
+        objects = [position + orientation for position, orientation in (body.pose() for body in self.bodies)]
+        return np.array([*self.arm.link_poses(), *objects])
 
     def close(self) -> None:
         """Free the physics client."""

@@ -4,6 +4,7 @@ The original meshes cost ten times the time of all the rest of a frame, and thei
 mirror symmetry of the scene. The model is derived by a deterministic rule, once, into the user's cache.
 """
 
+import dataclasses
 import functools
 import hashlib
 import math
@@ -26,8 +27,6 @@ FINGER_OPENING = 0.04  # metres each finger travels
 FINGER_TIP = 0.0536  # metres from the finger's frame to its tip
 _PAD_SIZE = (0.022, 0.014, 0.052)  # width along x, depth along the closing direction, length along z; metres
 _VISUAL_VERTICES = 26
-# Neither they nor their shadows are ever in the camera's view; drawing them would take a sixth of a frame's time.
-_OUT_OF_VIEW = ("link0", "link1", "link2")
 # The arm's own dynamics are not the subject: a light arm follows its set-points with forces that objects survive.
 _MASS_SCALE = 0.2
 _COLORS = {"link": "0.88 0.88 0.90 1", "dark": "0.22 0.23 0.25 1", "finger": "0.10 0.10 0.11 1"}
@@ -49,42 +48,65 @@ _SYMMETRY = {
 
 
 @functools.cache
-def panda_urdf(*, whole: bool = False) -> Path:
-    """Return the path of the light Panda's URDF; made on the first call on this machine.
-
-    Args:
-        whole: give the links that the camera never sees something to look at too, for a window.
-    """
+def panda_urdf() -> Path:
+    """Return the path of the light Panda's URDF; made on the first call on this machine."""
     source = Path(pybullet_data.getDataPath()) / "franka_panda"
-    hidden = () if whole else _OUT_OF_VIEW
-    folder = cache_folder("panda", _key(source, hidden))
+    folder = cache_folder("panda", _key(source))
     if not folder.is_dir():
         with committed_folder(folder) as temporary:
-            _derive(source, temporary, hidden)
+            _derive(source, temporary)
     return folder / URDF_NAME
 
 
-def _key(source: Path, hidden: tuple[str, ...]) -> str:
+@dataclasses.dataclass(frozen=True)
+class VisibleLink:
+    """What is seen of a link: `vertices` [V, 3] metres in its frame, `faces` [F, 3], `color` RGBA in 0..1."""
+
+    link: int
+    vertices: np.ndarray
+    faces: np.ndarray
+    color: tuple[float, ...]
+
+
+@functools.cache
+def visible_links() -> tuple[VisibleLink, ...]:
+    """Return what is seen of the light Panda but its base, which the camera never sees."""
+    meshes = {link: f"link{link + 1}" for link in ARM_JOINTS} | {HAND_LINK: "hand"}
+    meshes |= dict.fromkeys(FINGER_LINKS, "finger")
+    found = []
+    for link, name in meshes.items():
+        mesh = trimesh.load(panda_urdf().with_name(f"{name}.obj"), force="mesh", process=False)
+        vertices, places = np.unique(mesh.vertices, axis=0, return_inverse=True)
+        if link == FINGER_LINKS[1]:
+            # The first finger after half a turn about z.
+            vertices = vertices * (-1.0, -1.0, 1.0)
+        color = tuple(float(word) for word in _COLORS[_color_of(name)].split())
+        found.append(VisibleLink(link, vertices, places[mesh.faces], color))
+    return tuple(found)
+
+
+def _color_of(mesh: str) -> str:
+    return "finger" if mesh == "finger" else "dark" if mesh in ("hand", "link7", "link3", "link5") else "link"
+
+
+def _key(source: Path) -> str:
     """Return a digest of all that the model depends on: this rule, the original, and who computes the hulls."""
     originals = [source / URDF_NAME, *(_original(source, name) for name in _SYMMETRY)]
     content = b"".join(path.read_bytes() for path in (Path(__file__), *originals))
-    return hashlib.sha256(content + repr((hidden, versions("numpy", "scipy", "trimesh"))).encode()).hexdigest()
+    return hashlib.sha256(content + repr(versions("numpy", "scipy", "trimesh")).encode()).hexdigest()
 
 
 def _original(source: Path, name: str) -> Path:
     return source / "meshes" / "collision" / f"{name}.obj"
 
 
-def _derive(source: Path, folder: Path, hidden: tuple[str, ...]) -> None:
+def _derive(source: Path, folder: Path) -> None:
     for name, normals in _SYMMETRY.items():
         mesh = trimesh.load(_original(source, name), force="mesh", process=False)
         _write_flat_obj(folder / f"{name}.obj", symmetric_hull(np.asarray(mesh.vertices), normals))
     tree = ElementTree.parse(source / URDF_NAME)
     for link in tree.getroot().iter("link"):
         _lighten(link)
-        if link.get("name", "").removeprefix("panda_") in hidden:
-            for visual in link.findall("visual"):
-                link.remove(visual)
     for element in tree.getroot().findall("material"):
         tree.getroot().remove(element)
     tree.write(folder / URDF_NAME)
@@ -139,8 +161,7 @@ def _lighten(link: ElementTree.Element) -> None:
         if mesh is None:
             continue
         mesh.set("filename", re.sub(r".*/", "", mesh.get("filename", "")))
-        color = "finger" if finger else "dark" if hand or name in ("link7", "link3", "link5") else "link"
-        _set_material(visual, color)
+        _set_material(visual, _color_of("finger" if finger else name))
     for collision in link.findall("collision"):
         geometry = collision.find("geometry")
         if geometry is None or not (hand or finger):

@@ -17,7 +17,7 @@ from graspq.common.options import Settings
 from graspq.objects.object_set import ObjectSet
 
 # Raised by hand with every change of this folder that can change a pixel or a pose.
-SIMULATOR_VERSION = 1
+SIMULATOR_VERSION = 2
 EPISODES_PER_BIN = 20  # the paper switches the objects every 20 episodes
 
 

@@ -31,11 +31,9 @@ class World:
             gui: open a window (needs a display).
 
         Raises:
-            RuntimeError: PyBullet was built without NumPy, or the window cannot be opened.
+            RuntimeError: the window cannot be opened.
             UserError: a window was asked for and there is no display.
         """
-        if not bullet.isNumpyEnabled():
-            raise RuntimeError("this PyBullet was built without NumPy: images would come back as tuples; reinstall it")
         if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):
             # PyBullet ends the whole process where it finds no display.
             raise UserError("PyBullet's window needs a display (DISPLAY is not set); use render_mode='rgb_array'")
@@ -100,14 +98,10 @@ class World:
         )
         return Body(self, self._fixed_body(shape, visual, position))
 
-    def add_picture(self, boxes: Sequence[tuple[Vector, Vector]], position: Vector, color: Vector) -> "Body":
-        """Add an immovable body that nothing collides with: boxes by half extents and place in its frame, metres."""
-        visual = bullet.createVisualShapeArray(
-            shapeTypes=[bullet.GEOM_BOX] * len(boxes),
-            halfExtents=[half for half, _ in boxes],
-            visualFramePositions=[place for _, place in boxes],
-            rgbaColors=[color] * len(boxes),
-            physicsClientId=self.client,
+    def add_picture(self, half_extents: Vector, position: Vector, color: Vector) -> "Body":
+        """Add an immovable box that nothing collides with (half extents and position in metres, RGBA in 0..1)."""
+        visual = bullet.createVisualShape(
+            bullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=color, physicsClientId=self.client
         )
         return Body(self, self._fixed_body(-1, visual, position))
 

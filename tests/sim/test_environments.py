@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 import graspq  # noqa: F401  (registers the environments)
 from graspq.common.errors import UserError
+from graspq.sim.observation import ARM, STILL
 
 NAMES = {"regular": "graspq/RegularGrasping-v0", "targeted": "graspq/TargetedGrasping-v0"}
 
@@ -138,3 +139,21 @@ def test_a_task_of_ones_own_is_an_environment(folders, tmp_path, monkeypatch):
     ends = [environment.step(np.zeros(4, np.float32))[2] for _ in range(3)]
     assert ends == [False, False, True] and len(environment.unwrapped.simulation.object_ids) == 2
     environment.close()
+
+
+def test_depth_and_mask_come_in_info_on_request_alone(folders):
+    plain = gymnasium.make(NAMES["regular"], objects=folders["regular"]).unwrapped
+    assert set(plain.reset(seed=1)[1]) == {"gripper_pose"}
+    environment = gymnasium.make(NAMES["regular"], objects=folders["regular"], depth_and_mask=True).unwrapped
+    check_env(environment)
+    _, info = environment.reset(seed=1)
+    assert set(info) == {"gripper_pose", "depth", "mask"}
+    assert (info["depth"].dtype, info["depth"].shape) == (np.float32, (64, 64))
+    assert 0.4 < info["depth"].min() < info["depth"].max() < 1.5, "metres"
+    assert set(np.unique(info["mask"])) <= {ARM, STILL, 0, 1, 2, 3, 4}
+    assert {ARM, STILL} < set(np.unique(info["mask"]))
+    before = info["mask"].copy()
+    environment.step(np.array([1, 1, -1, 1], dtype=np.float32))
+    np.testing.assert_array_equal(info["mask"], before)
+    for other in (plain, environment):
+        other.close()

@@ -102,3 +102,31 @@ def test_the_objects_rest_in_the_bin_before_the_first_action(simulation):
         assert (before[:, 2] > 0).all() and (before[:, 2] < 0.15).all()
         simulation.step([0, 0, 0, 0])
         assert np.abs(simulation.object_poses()[:, :3] - before[:, :3]).max() < 0.002
+
+
+def test_the_mask_numbers_objects_by_their_place_in_the_bin(simulation):
+    simulation.reset(np.random.default_rng(0))
+    simulation.arm.park()
+    usual = simulation.depth_and_mask(128)[1]
+    picture = simulation.render(128)
+    for place, body in enumerate(simulation.bodies):
+        position, orientation = body.pose()
+        body.set_pose((0.3, 0.0, -1.0), orientation)
+        mask = simulation.depth_and_mask(128)[1]
+        changed = (simulation.render(128) != picture).any(axis=-1)
+        assert changed.any()
+        assert place in usual and place not in mask
+        assert changed[usual == place].mean() > 0.9
+        assert np.array_equal(mask[usual != place], usual[usual != place])
+        body.set_pose(position, orientation)
+    assert np.array_equal(simulation.render(128), picture)
+
+
+def test_observations_have_depth_and_mask_on_request_alone(simulation, regular_objects):
+    assert simulation.reset(np.random.default_rng(0)).depth is None
+    with GraspSimulation(TASK, regular_objects, depth_and_mask=True) as other:
+        other.load(simulation.object_ids)
+        seen = other.reset(np.random.default_rng(0))
+        np.testing.assert_array_equal(seen.image, simulation.observation.image)
+        for found, expected in zip((seen.depth, seen.mask), simulation.depth_and_mask(64), strict=True):
+            np.testing.assert_array_equal(found, expected)

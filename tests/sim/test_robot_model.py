@@ -3,6 +3,8 @@ import pytest
 import trimesh
 
 from graspq.sim import robot_model
+from graspq.sim.bullet import bullet
+from graspq.sim.world import World
 
 
 @pytest.mark.parametrize("normals", list(robot_model._SYMMETRY.values()))
@@ -24,6 +26,21 @@ def test_the_light_panda_has_few_faces_and_collides_with_hand_and_fingers_alone(
     text = robot_model.panda_urdf().read_text()
     assert text.count("<collision") == 3
     assert text.count("<box") == 2
+
+
+def test_what_is_drawn_are_the_links_of_the_urdf_with_its_colours_and_one_finger_is_the_others_mirror_image():
+    drawn = robot_model.visible_links()
+    assert [visible.link for visible in drawn] == [0, 1, 2, 3, 4, 5, 6, 8, 9, 10]
+    colors = {visible.link: visible.color for visible in drawn}
+    world = World(time_step=1 / 240, solver_iterations=1)
+    number = world.load_urdf(robot_model.panda_urdf(), fixed=True).number
+    shapes = {shape[1]: shape for shape in bullet.getVisualShapeData(number, physicsClientId=world.client)}
+    assert set(shapes) == {-1, *colors}
+    for link, color in colors.items():
+        assert shapes[link][7] == pytest.approx(color)
+    first, second = drawn[-2:]
+    assert {tuple(corner) for corner in first.vertices * (1, -1, 1)} == {tuple(corner) for corner in second.vertices}
+    world.close()
 
 
 def test_the_model_is_made_once_in_the_users_cache_and_is_the_same_when_made_again(tmp_path, monkeypatch):
