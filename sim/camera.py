@@ -35,7 +35,7 @@ class Camera:
     ambient: float = 0.55
     diffuse: float = 0.45
     shaded: float = 0.5
-    shadow_half: float = 0.36
+    shadow_half: float = 0.33
 
     def view(self) -> np.ndarray:
         """Return what the rasteriser takes, float64 [11]; products and roots alone, which all machines agree on."""
