@@ -23,7 +23,6 @@ from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, co
 from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.loader import TransitionLoader
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
 from graspq.train.batch import to_tensors
@@ -82,7 +81,7 @@ def ours(open_pool: Callable[[], ShardPool], batch_size: int, batches: int, buff
     """Return what opens a pool and takes so many batches with s' from it as tensors."""
 
     def read() -> None:
-        with TransitionLoader(open_pool(), batch_size, 0, buffer_bytes) as loader:
+        with open_pool().batches(batch_size, buffer_bytes=buffer_bytes) as loader:
             consume((to_tensors(batch, CPU) for batch in loader), batches)
 
     return read

@@ -20,8 +20,8 @@ from graspq.datagen.settings import CollectionSettings
 from graspq.datagen.shards import check_disk
 from graspq.datasets.blocks import BlockRef
 from graspq.datasets.card import write_card
-from graspq.datasets.dataset import Dataset
-from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from graspq.datasets.dataset import open_shards
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, steps_file
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.engine import EngineSettings
@@ -132,7 +132,7 @@ class GrowingDataset:
         return tuple(ref for blocks in self.blocks[:rounds] for ref in blocks)
 
     def _take_up(self, entry: ShardEntry) -> None:
-        self.blocks.append(Dataset(self.folder, self.manifest).shard_pool(entry).blocks)
+        self.blocks.append(open_shards([self.folder / steps_file(entry.name)]).blocks)
 
     def _require_round(self, number: int, entry: ShardEntry) -> None:
         first = number * self.collection.blocks_per_shard

@@ -4,12 +4,11 @@ from pathlib import Path
 import numpy as np
 
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.loader import TransitionLoader
 from graspq.online.pools import PoolOfRounds
 
 
 def batches(pool, count=4):
-    with TransitionLoader(pool, 16, seed=3, start_step=5, prefetch=0) as loader:
+    with pool.batches(16, seed=3, start_step=5, prefetch=0) as loader:
         return [next(loader) for _ in range(count)]
 
 

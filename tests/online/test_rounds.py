@@ -14,7 +14,8 @@ import pytest
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
 from graspq.datagen import collect
-from graspq.datasets.dataset import Dataset, open_shards
+from graspq.datasets.dataset import open_shards
+from graspq.datasets.manifest import Manifest
 from graspq.datasets.verify import verify
 from graspq.objects.object_set import ObjectSet
 from graspq.online import growth
@@ -67,14 +68,13 @@ def test_the_grasps_are_a_dataset_that_says_how_it_was_made(unbroken: Run) -> No
     folder = unbroken.folder / "dataset"
     report = verify(folder)
     assert report.faults == () and report.notes[1:] == ()
-    dataset = Dataset.open(folder)
-    rows = [row for entry in dataset.manifest.shards for row in dataset.episode_rows(entry)]
-    assert [row["episode_id"] for row in rows] == list(range(6))
-    assert [row["policy"] for row in rows[::2]] == ["dql@6", "dql@12", "dql@18"]
-    assert [row["exploration"] for row in rows[::2]] == pytest.approx([0.715, 0.43, 0.145], abs=1e-9)
-    assert dataset.manifest.settings["online"]["start"]["step"] == 6
+    grasps = list(open_shards([folder]))
+    assert [episode.episode_id for episode in grasps] == list(range(6))
+    assert [episode.policy for episode in grasps[::2]] == ["dql@6", "dql@12", "dql@18"]
+    assert [episode.exploration for episode in grasps[::2]] == pytest.approx([0.715, 0.43, 0.145], abs=1e-9)
+    assert Manifest.load(folder).settings["online"]["start"]["step"] == 6
     train_objects = ObjectSet.load(folder / "objects").ids("train")
-    assert {name for row in rows for name in row["object_ids"]} <= set(train_objects)
+    assert {name for episode in grasps for name in episode.object_ids} <= set(train_objects)
 
 
 def test_grasp_train_could_read_base_and_new_grasps_as_one_pool(unbroken: Run, base: Path) -> None:
@@ -166,7 +166,7 @@ def test_the_command_killed_with_sigkill_and_resumed_ends_as_an_unbroken_run(
     finally:
         process.kill()
         process.wait()
-    assert len(Dataset.open(out / "dataset").manifest.shards) < 3
+    assert len(Manifest.load(out / "dataset").shards) < 3
     assert outcome(run_online(make_plan(out))) == outcome(unbroken)
 
 
@@ -199,7 +199,6 @@ def test_from_scratch_every_estimator_needs_the_pool_alone_and_collects_by_its_l
         validation_fraction=0.2, cem_samples=8, cem_elites=2,
     )  # fmt: skip
     run = run_online(plan)
-    dataset = Dataset.open(run.folder / "dataset")
-    rows = [row for entry in dataset.manifest.shards for row in dataset.episode_rows(entry)]
-    assert [(row["policy"], row["exploration"]) for row in rows] == [(f"{algo}@0", 1.0), (f"{algo}@1", 0.0)]
+    grasps = list(open_shards([run.folder / "dataset"]))
+    assert [(episode.policy, episode.exploration) for episode in grasps] == [(f"{algo}@0", 1.0), (f"{algo}@1", 0.0)]
     assert run.config["online"]["start"] is None and run.checkpoint().name == "step-00000002"

@@ -11,8 +11,7 @@ from torch.utils.data import DataLoader
 
 import graspq
 from graspq.common.errors import UserError
-from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.loader import TransitionLoader
+from graspq.datasets.batch import EpisodeBatch
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +51,6 @@ def test_episodes_can_be_iterated_and_end(new_dataset):
         grasps[4]
 
 
-def test_batches_are_those_of_the_loader_in_the_same_order(grasps):
-    ours = first(grasps.batches(64, seed=3), 5)
-    theirs = first(TransitionLoader(grasps.pool, 64, 3), 5)
-    for one, two in zip(ours, theirs, strict=True):
-        assert isinstance(one, TransitionBatch)
-        assert all(np.array_equal(array, two.arrays()[name]) for name, array in one.arrays().items())
-    resumed = first(grasps.batches(64, seed=3, start_step=4), 1)[0]
-    assert np.array_equal(resumed.image, ours[4].image)
-
-
 def test_torch_takes_the_arrays_of_a_batch_without_a_copy(grasps):
     for view in ("transitions", "episodes"):
         (batch,) = first(grasps.batches(16, view=view), 1)
@@ -80,7 +69,7 @@ def test_every_row_and_episode_comes_once_for_validation(grasps):
 def test_held_back_grasps_share_no_block_with_the_others(grasps):
     training, held_back = grasps.split(0.2, seed=1)
     assert len(training) + len(held_back) == 800
-    blocks = [{ref.block for ref in side.pool.blocks} for side in (training, held_back)]
+    blocks = [{ref.block for ref in side.blocks} for side in (training, held_back)]
     assert not blocks[0] & blocks[1]
     assert held_back[0].block in blocks[1]
 
