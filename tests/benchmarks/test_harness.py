@@ -4,31 +4,45 @@ import json
 import mmap
 import os
 import time
-from pathlib import Path
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
 
-from graspq.benchmarks.measuring import (
-    Call,
+from graspq.benchmarks.harness import (
     Ratio,
     Result,
     TurnsSettings,
+    alone,
     apart,
+    check_equal,
     command,
-    greatest_difference,
+    compared,
     median_ratio,
     resident_bytes,
     take_turns,
+    timed,
 )
 from graspq.common.errors import UserError
 
 
 def test_rivals_take_turns_and_every_other_turn_is_backwards() -> None:
     order: list[str] = []
-    seconds = take_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3)
+
+    def rival(name: str) -> Callable[[int], int]:
+        return lambda turn: order.append(name) or turn
+
+    assert take_turns({"a": rival("a"), "b": rival("b")}, 3) == {"a": [0, 1, 2], "b": [0, 1, 2]}
     assert "".join(order) == "baabbaab"
-    assert {name: len(values) for name, values in seconds.items()} == {"a": 3, "b": 3}
+    assert take_turns({"a": rival("a")}, 1, warm_up=False) == {"a": [0]} and len(order) == 9
+
+
+def test_a_rival_takes_the_seconds_of_a_unit() -> None:
+    assert 0.01 <= timed(lambda: time.sleep(0.05), 5)(0) < 0.05
+    fast, slow = compared("rival", "sample", {"ours": [0.01, 0.02], "png": [0.1, 0.3]}, "png")
+    assert fast == {"rival": "ours", "ms a sample": 15, "samples a second": pytest.approx(1 / 0.015), "times png": 12.5}
+    assert slow["times png"] == 1
 
 
 def test_a_slow_turn_of_all_rivals_does_not_move_the_ratio() -> None:
@@ -51,18 +65,18 @@ def test_a_line_of_the_table_says_whether_its_bar_was_met(ratio: Ratio, row: lis
     assert ratio.row() == row
 
 
-def test_calls_are_made_one_after_the_other_each_in_a_process_of_its_own() -> None:
-    processes = list(apart([Call(os.getpid), Call(os.getpid), Call(time.sleep, (0,))]))
-    assert len({os.getpid(), *processes[:2]}) == 3 and processes[2] is None
+def test_calls_are_made_each_in_a_process_of_its_own() -> None:
+    processes = apart(partial(os.getpid), partial(os.getpid))
+    assert len({os.getpid(), alone(os.getpid), *processes}) == 4 and alone(divmod, 7, 2) == (3, 1)
 
 
 def test_a_rival_that_computes_something_else_is_refused() -> None:
     ours = torch.tensor([0.5, 0.5])
     near = {"near": torch.tensor([0.5, 0.49995]), "equal": ours}
-    assert greatest_difference(ours, near) == pytest.approx(5e-5, rel=1e-2)
+    check_equal(ours, near)
     for value, shown in ((0.6, "0.1"), (float("nan"), "nan")):
         with pytest.raises(UserError, match=f"broken: differs from ours by {shown}"):
-            greatest_difference(ours, {"broken": torch.tensor([0.5, value])})
+            check_equal(ours, {"broken": torch.tensor([0.5, value])})
 
 
 def test_memory_is_that_of_this_process() -> None:
@@ -72,13 +86,11 @@ def test_memory_is_that_of_this_process() -> None:
         assert resident_bytes() - before > 40_000_000
 
 
-def test_a_command_prints_and_writes_what_it_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_prints_what_it_measured_and_returns_it(capsys: pytest.CaptureFixture[str]) -> None:
     result = Result([Ratio("x", 2.0)], {"Rows": [{"name": "a", "number": 0.12345}]}, {"threads": 2})
     main = command(TurnsSettings, lambda settings: result)
-    with pytest.raises(SystemExit) as ended:
-        main.main(["--out", str(tmp_path / "out.json")])
-    assert ended.value.code == 0
-    assert "| a | 0.123 |" in capsys.readouterr().out
-    found = json.loads((tmp_path / "out.json").read_text())
+    found = json.loads(json.dumps(main.invoke(main.make_context("x", []))))
+    shown = capsys.readouterr().out
+    assert "| a | 0.123 |" in shown and "| x | 2 |  |  |  |" in shown
     assert Ratio(**found["ratios"][0]) == result.ratios[0] and found["tables"] == result.tables
     assert found["measured"]["versions"]["torch"] and found["threads"] == 2 and found["settings"] == {"turns": 5}
