@@ -155,7 +155,7 @@ def compared(what: str, unit: str, seconds: Mapping[str, Sequence[float]], again
     return [
         {
             what: name,
-            f"ms a {unit}": 1e3 * statistics.median(values),
+            "ms each": 1e3 * statistics.median(values),
             f"{unit}s a second": 1 / statistics.median(values),
             f"times {against}": median_ratio(seconds[against], values),
         }

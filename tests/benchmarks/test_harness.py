@@ -41,7 +41,7 @@ def test_rivals_take_turns_and_every_other_turn_is_backwards() -> None:
 def test_a_rival_takes_the_seconds_of_a_unit() -> None:
     assert 0.01 <= timed(lambda: time.sleep(0.05), 5)(0) < 0.05
     fast, slow = compared("rival", "sample", {"ours": [0.01, 0.02], "png": [0.1, 0.3]}, "png")
-    assert fast == {"rival": "ours", "ms a sample": 15, "samples a second": pytest.approx(1 / 0.015), "times png": 12.5}
+    assert fast == {"rival": "ours", "ms each": 15, "samples a second": pytest.approx(1 / 0.015), "times png": 12.5}
     assert slow["times png"] == 1
 
 
