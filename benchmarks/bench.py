@@ -10,11 +10,10 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import click
 
-from graspq.benchmarks.measuring import Call, Ratio, apart, table
+from graspq.benchmarks.harness import COLUMNS, Ratio, Row, alone, table
 from graspq.common.errors import UserError
 from graspq.common.files import read_json, write_json, write_text
 from graspq.common.machine import available_cores
@@ -22,7 +21,7 @@ from graspq.common.options import Command, Settings, options_from, setting
 from graspq.common.text import markdown
 
 BEGIN, END = "<!-- made by benchmarks/bench.py -->", "<!-- end -->"
-# {shards} and {run} stand for the options of this command, {work} for a folder of the part.
+# A script with its options. {shards} and {run} stand for the options of this command, {work} for a folder of the part.
 PARTS = {
     "collection": "collection",
     "worker_memory": "worker_memory --scenes 10000",
@@ -43,56 +42,32 @@ class BenchSettings(Settings):
 
     shards: str = setting("data/regular-10k", help="Dataset folder.")
     run: str = setting("runs/mc-regular-10k-seed0", help="Run that is evaluated.")
-    part: tuple[str, ...] = setting((), help=f"What to measure: {', '.join(PARTS)}. Default: all.")
-    again: tuple[str, ...] = setting((), help="Measure this part anew; may be repeated.")
+    part: tuple[str, ...] = setting((), help=f"Measure these anew: {', '.join(PARTS)}. Default: all not in --work.")
     work: Path = setting(Path("runs/bench"), help="Folder of the parts' figures.")
     out: Path = setting(Path("results/bench.json"), help="All figures.")
     page: Path = setting(Path("RESULTS.md"), help="Page for the table.")
 
     def __post_init__(self) -> None:
-        """Check the names of parts.
-
-        Raises:
-            UserError: one is unknown.
-        """
+        """Refuse unknown names of parts (`UserError`)."""
         super().__post_init__()
-        for name in {*self.part, *self.again} - set(PARTS):
+        for name in set(self.part) - set(PARTS):
             raise UserError(f"{name!r} is no part of the benchmarks; choose from {', '.join(PARTS)}")
 
 
-def run_script(script: str, words: list[str]) -> None:
-    """Run a benchmark's command in this process.
-
-    Raises:
-        UserError: it failed.
-    """
-    try:
-        importlib.import_module(f"graspq.benchmarks.{script}").main.main(words, prog_name=script)
-    except SystemExit as ended:
-        if ended.code:
-            raise UserError(f"{script}: ended with status {ended.code}; its words are above, nothing is kept") from None
-
-
-def measured(name: str, words: list[str], work: Path, again: bool) -> dict[str, Any]:
-    """Return what a part found, after running it if that is not there yet."""
-    path, fresh = work / f"{name}.json", work / f"{name}.fresh.json"
-    if again:
-        shutil.rmtree(work / name, ignore_errors=True)  # what it went on from
-    if again or not path.exists():
-        click.echo(f"\n== {name}: python benchmarks/{words[0]}.py {' '.join(words[1:])}", err=True)
-        for _ in apart([Call(run_script, (words[0], [*words[1:], "--out", str(fresh)]))]):
-            fresh.replace(path)
-    found: dict[str, Any] = read_json(path, "benchmark's figures")
+def run_script(script: str, *words: str) -> Row:
+    """Return what a benchmark's command finds, run in this process."""
+    main: click.Command = importlib.import_module(f"graspq.benchmarks.{script}").main
+    found: Row = main.invoke(main.make_context(script, list(words)))
     return found
 
 
-def page_section(found: Mapping[str, Mapping[str, Any]], commands: Mapping[str, str], facts: str) -> str:
+def page_section(found: Mapping[str, Row], commands: Mapping[str, str], facts: str) -> str:
     """Return what the page shows: the ratios, each part's first with its command, and where the time goes."""
     rows: list[list[str]] = []
     for name, part in found.items():
         lines = [Ratio(**ratio).row() for ratio in part["ratios"]]
         rows += [[*line, f"`{commands[name]}`" if line is lines[0] else ""] for line in lines]
-    text = markdown(("in one run", "measured", "bar", "aim", "met", "command"), rows) + f"\n{facts}\n"
+    text = markdown((*COLUMNS, "command"), rows) + f"\n{facts}\n"
     for part in found.values():
         for title, shown in part["tables"].items():
             text += f"\n### {title}\n\n{table(shown)}" if title in PUBLISHED_TABLES else ""
@@ -100,11 +75,7 @@ def page_section(found: Mapping[str, Mapping[str, Any]], commands: Mapping[str, 
 
 
 def with_section(text: str, between: str) -> str:
-    """Return a page with what stands between its two marks replaced.
-
-    Raises:
-        UserError: the marks are not there.
-    """
+    """Return a page with what stands between its two marks replaced; `UserError` where they are not there."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
@@ -112,35 +83,44 @@ def with_section(text: str, between: str) -> str:
     return f"{before}{BEGIN}\n\n{between}\n{END}{after}"
 
 
-def processor() -> str:
-    """Return the processor's name, as far as the system tells."""
-    try:
-        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    return found[1] if found else "unknown processor"
+def write_page(page: Path, out: Path) -> None:
+    """Write the table of a page from the stored figures."""
+    stored = read_json(out, "benchmarks' figures")
+    facts = f"{stored['machine']}. Every figure, with the day and the code of each part: [{out}]({out})."
+    write_text(page, with_section(page.read_text(), page_section(stored["parts"], stored["commands"], facts)))
+
+
+def machine() -> str:
+    """Return the processor's name, as far as the system tells, and the number of cores."""
+    described = Path("/proc/cpuinfo")
+    found = re.search(r"(?m)^model name\s*:\s*(.+)$", described.read_text() if described.is_file() else "")
+    return f"{found[1] if found else 'unknown processor'}, {available_cores()} cores"
 
 
 @click.command(cls=Command)
 @options_from(BenchSettings)
 def main(settings: BenchSettings) -> None:
-    """Run the benchmarks that are not done yet, and write their figures and the table of ratios."""
+    """Run the benchmarks that are asked for or not done yet; write their figures and the table of ratios."""
     settings.work.mkdir(parents=True, exist_ok=True)
-    published = read_json(settings.out, "benchmarks' figures") if settings.out.exists() else {"parts": {}}
-    found: dict[str, dict[str, Any]] = {}
+    stored = read_json(settings.out, "benchmarks' figures") if settings.out.exists() else {"parts": {}, "commands": {}}
+    found: dict[str, Row] = {}
     commands: dict[str, str] = {}
     for name, template in PARTS.items():
-        work = (settings.work / name).as_posix()
-        words = template.format(shards=settings.shards, run=settings.run, work=work).split()
-        commands[name] = f"python benchmarks/{words[0]}.py {' '.join(words[1:])}".strip()
-        if name in (settings.part or PARTS) or name in settings.again:
-            found[name] = measured(name, words, settings.work, name in settings.again)
-        elif name in published["parts"]:
-            found[name], commands[name] = published["parts"][name], published["commands"][name]
-    where = f"{processor()}, {available_cores()} cores"
-    write_json(settings.out, {"machine": where, "commands": commands, "parts": found})
-    facts = f"{where}. Every figure, with the day and the code of each part: [{settings.out}]({settings.out})."
-    write_text(settings.page, with_section(settings.page.read_text(), page_section(found, commands, facts)))
+        work, path = settings.work / name, settings.work / f"{name}.json"
+        script, *words = template.format(shards=settings.shards, run=settings.run, work=work.as_posix()).split()
+        if settings.part and name not in settings.part:
+            if name in stored["parts"]:
+                found[name], commands[name] = stored["parts"][name], stored["commands"][name]
+            continue
+        commands[name] = " ".join([f"python benchmarks/{script}.py", *words])
+        if settings.part:
+            shutil.rmtree(work, ignore_errors=True)  # what it would go on from
+        if settings.part or not path.exists():
+            click.echo(f"\n== {name}: {commands[name]}", err=True)
+            write_json(path, alone(run_script, script, *words))
+        found[name] = read_json(path, "benchmark's figures")
+    write_json(settings.out, {"machine": machine(), "commands": commands, "parts": found})
+    write_page(settings.page, settings.out)
 
 
 if __name__ == "__main__":

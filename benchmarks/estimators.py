@@ -6,15 +6,15 @@ python benchmarks/estimators.py --shards data/regular-10k
 import contextlib
 from dataclasses import dataclass
 
-from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, compared, take_turns
-from graspq.benchmarks.sessions import ready, steps_on, training_of, update_of
+from graspq.benchmarks.harness import DataSettings, Ratio, Result, command, compared, median_ratio, take_turns, timed
+from graspq.benchmarks.sessions import ready, steps_on, training_of
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
 from graspq.train.estimators import ESTIMATORS
 
 
 @dataclass(frozen=True)
-class EstimatorsSettings(TrainingSpeedSettings):
+class EstimatorsSettings(DataSettings):
     """Settings of this benchmark."""
 
     steps: int = setting(6, help="Steps of each estimator in a turn.", minimum=1)
@@ -22,22 +22,20 @@ class EstimatorsSettings(TrainingSpeedSettings):
 
 def measure(settings: EstimatorsSettings) -> Result:
     """Return the speed of each estimator of the table."""
-    pool = open_shards(settings.shards)
-    runs, real = {}, {}
+    pool, arms = open_shards(settings.shards), {}
     with contextlib.ExitStack() as stack:
         for name in ESTIMATORS:
-            current = stack.enter_context(training_of(name, pool, settings))
+            current = stack.enter_context(training_of(name, settings.shards, pool))
             batches = ready(current, pool, settings.steps)
-            runs[name] = steps_on(batches, update_of(current))
-            real[name] = sum(int(batch.real_steps.sum()) for batch in batches)
-        seconds = take_turns(runs, settings.turns)
-    rows, times = compared("estimator", "transitions", seconds, real, "mc")
+            real = sum(int(batch.real_steps.sum()) for batch in batches)
+            arms[name] = timed(steps_on(batches, current.update), real)
+        seconds = take_turns(arms, settings.turns)
     return Result(
         [
-            Ratio("transitions a second of `dql`, against `mc`", times["dql"], bar=0.5),
-            Ratio("… of `corr-mc`", times["corr-mc"], bar=0.4),
+            Ratio("transitions a second of `dql`, against `mc`", median_ratio(seconds["mc"], seconds["dql"]), bar=0.5),
+            Ratio("… of `corr-mc`", median_ratio(seconds["mc"], seconds["corr-mc"]), bar=0.4),
         ],
-        {"Training speed of the estimators": rows},
+        {"Training speed of the estimators": compared("estimator", "transition", seconds, "mc")},
     )
 
 

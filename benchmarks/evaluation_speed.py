@@ -3,28 +3,31 @@
 python benchmarks/evaluation_speed.py runs/mc-regular-10k-seed0
 """
 
-import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from graspq.benchmarks.measuring import (
-    Call,
+from graspq.benchmarks.harness import (
     Ratio,
     Result,
     TurnsSettings,
     apart,
+    check_equal,
     command,
-    greatest_difference,
+    compared,
     median_ratio,
+    take_turns,
 )
 from graspq.benchmarks.rivals import ANEW, ONCE, TILED, WAYS, asking
 from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
 from graspq.common.options import setting
+from graspq.engine import EngineSettings
 from graspq.evaluate.evaluation import prepare
 from graspq.evaluate.jobs import jobs_from_settings
 from graspq.evaluate.rollout import Rollouts, run_rollouts
@@ -33,7 +36,7 @@ from graspq.policies.of_run import RunPolicy
 from graspq.sim.observation import Observation
 
 OURS = "graspq, start-up included"
-Successes = dict[int, bool]
+Played = tuple[float, dict[int, bool]]  # seconds, and which episodes succeeded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,20 +46,12 @@ class EvaluationSettings(TurnsSettings):
     run: Path = setting(help="Run folder whose policy searches.", positional=True, metavar="RUN")
     turns: int = setting(3, help="Turns that are measured.", minimum=1)
     episodes: int = setting(128, help="Episodes in a turn.", minimum=1)
-    rival_episodes: int | None = setting(None, help="The rivals', the first of ours; all if not given.", minimum=1)
-    workers: int | None = setting(None, help="Processes; the number of cores if not given.", minimum=1)
-    split: str = setting("test", help="Split of the object set.")
-    seed: int = setting(0, help="Seed of the scenes.", minimum=0)
-    objects: Path | None = setting(None, help="Object set; the run's if not given.")
+    rival_episodes: int = setting(128, help="The rivals', the first of ours.", minimum=1)
 
 
 @torch.inference_mode()
 def check_rivals(policy: RunPolicy) -> None:
-    """Refuse rivals that find other actions or Q than ours, on pictures of noise.
-
-    Raises:
-        UserError: they do, or the policy has no search that could be compared.
-    """
+    """Refuse rivals that find other actions or Q than ours, and a policy without a search (`UserError`)."""
     if not policy.searches:
         raise UserError(f"{policy.name}: acts by an actor network; name a run that searches, such as one of mc")
     shape = policy.origin.specification.image_shape
@@ -67,11 +62,18 @@ def check_rivals(policy: RunPolicy) -> None:
         action = acting.act(seen, np.random.default_rng(1))
         return torch.from_numpy(np.append(action, acting.q if acting.q is not None else np.nan))
 
-    greatest_difference(found(policy), {way: found(asking(policy, way)) for way in WAYS})
+    check_equal(found(policy), {way: found(asking(policy, way)) for way in WAYS})
 
 
-def one_at_a_time(rollouts: Rollouts, episodes: range) -> tuple[float, Successes]:
-    """Return the seconds of some episodes in this process, and their successes; the first is played once before."""
+def at_once(rollouts: Rollouts, episodes: int) -> Played:
+    """Evaluate some episodes as `grasp-eval` does."""
+    start = time.perf_counter()
+    rows, _ = run_rollouts(rollouts, episodes, EngineSettings())
+    return time.perf_counter() - start, {row.episode: row.success for row in rows}
+
+
+def one_at_a_time(rollouts: Rollouts, episodes: range) -> Played:
+    """Play some episodes in this process; the first is played once before."""
     with rollouts.open(lambda folder: folder) as play:
         play(episodes[:1])
         start = time.perf_counter()
@@ -79,60 +81,39 @@ def one_at_a_time(rollouts: Rollouts, episodes: range) -> tuple[float, Successes
         return time.perf_counter() - start, {film.row.episode: film.row.success for film in films}
 
 
-def together(rollouts: Rollouts, episodes: int, workers: int) -> tuple[float, Successes]:
-    """Return the seconds of the slowest of so many processes that share the episodes, and all successes."""
-    calls = [Call(one_at_a_time, (rollouts, range(number, episodes, workers))) for number in range(workers)]
-    seconds, successes = zip(*apart(calls, at_once=workers), strict=True)
+def together(rollouts: Rollouts, episodes: int) -> Played:
+    """Let as many processes as there are cores share some episodes; the seconds are those of the slowest."""
+    workers = min(available_cores(), episodes)
+    parts = [partial(one_at_a_time, rollouts, range(number, episodes, workers)) for number in range(workers)]
+    seconds, successes = zip(*apart(*parts), strict=True)
     return max(seconds), {episode: success for part in successes for episode, success in part.items()}
 
 
 def measure(settings: EvaluationSettings) -> Result:
-    """Return episodes a second of the evaluation of RUN, and of the rivals (on the CPU)."""
-    workers = settings.workers if settings.workers is not None else available_cores()
-    given = EvalSettings(
-        runs=(str(settings.run),),
-        split=settings.split,
-        episodes=settings.episodes,
-        seed=settings.seed,
-        objects=settings.objects,
-        workers=workers,
-        device="cpu",
-    )
+    """Return episodes a second of the evaluation of RUN and of the rivals, on the CPU."""
+    given = EvalSettings(runs=(str(settings.run),), device="cpu")
     prepared = prepare(jobs_from_settings(given)[0], given)
     assert prepared.run is not None
     check_rivals(prepared.run)
-    theirs = min(max(settings.rival_episodes or settings.episodes, workers), settings.episodes)
-    pace: dict[str, list[float]] = {name: [] for name in (OURS, *WAYS)}
-    successes: dict[str, Successes] = {}
-    for turn in range(settings.turns):
-        start = time.perf_counter()
-        played, _ = run_rollouts(prepared.rollouts, settings.episodes, given.where)
-        pace[OURS].append((time.perf_counter() - start) / settings.episodes)
-        successes[OURS] = {row.episode: row.success for row in played}
-        for way in list(WAYS)[:: 1 if turn % 2 else -1]:
-            rollouts = Rollouts(prepared.scenes, asking(prepared.run, way))
-            seconds, successes[way] = together(rollouts, theirs, workers)
-            pace[way].append(seconds / theirs)
-    times = {name: median_ratio(values, pace[OURS]) for name, values in pace.items()}
-    rows = [
-        {
-            "evaluation": name,
-            "episodes a second": 1 / statistics.median(values),
-            "graspq is faster, times": times[name],
-            "episodes": len(successes[name]),
-            "successes": sum(successes[name].values()),
-            "end as ours": sum(successes[OURS][episode] == one for episode, one in successes[name].items()),
-        }
-        for name, values in pace.items()
-    ]
+    theirs = min(settings.rival_episodes, settings.episodes)
+    arms: dict[str, Callable[[int], Played]] = {OURS: lambda turn: at_once(prepared.rollouts, settings.episodes)}
+    for way in WAYS:
+        rollouts = Rollouts(prepared.scenes, asking(prepared.run, way))
+        arms[way] = lambda turn, rollouts=rollouts: together(rollouts, theirs)  # type: ignore[misc]
+    played = take_turns(arms, settings.turns, warm_up=False)
+    seconds = {name: [spent / len(successes) for spent, successes in turns] for name, turns in played.items()}
+    ours = played[OURS][0][1]
+    same = {way: sum(ours[episode] == one for episode, one in played[way][0][1].items()) for way in WAYS}
+    says = "episodes a second, against one at a time with tiled copies"
+    once = "… one at a time, trunk once (our network), its start not counted"
     return Result(
         [
-            Ratio("episodes a second, against one at a time with tiled copies", times[TILED], bar=4, aim=8),
-            Ratio("… one at a time, trunk each iteration", times[ANEW]),
-            Ratio("… one at a time, trunk once (our network), its start not counted", times[ONCE], aim=0.95),
+            Ratio(says, median_ratio(seconds[TILED], seconds[OURS]), bar=4, aim=8),
+            Ratio("… one at a time, trunk each iteration", median_ratio(seconds[ANEW], seconds[OURS])),
+            Ratio(once, median_ratio(seconds[ONCE], seconds[OURS]), aim=0.95),
         ],
-        {"Evaluation (CEM: 3 iterations of 64 samples)": rows},
-        {"workers of each": workers},
+        {"Evaluation (CEM: 3 iterations of 64 samples)": compared("evaluation", "episode", seconds, TILED)},
+        {"workers of each": available_cores(), "successes of ours": sum(ours.values()), "end as ours": same},
     )
 
 

@@ -11,6 +11,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,36 +20,36 @@ import numpy as np
 import torch
 
 from graspq.benchmarks import loading_rivals as rivals
-from graspq.benchmarks.measuring import Ratio, Result, TrainingSpeedSettings, command, compared, take_turns
+from graspq.benchmarks.harness import DataSettings, Ratio, Result, command, compared, median_ratio, take_turns, timed
+from graspq.benchmarks.sessions import CPU
 from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.loader import TransitionLoader
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.sampler import Sampler
 from graspq.train.batch import to_tensors
 
+BATCH_SIZE = 256
 TIMES = 10  # the data over the buffer, in streaming
 STREAMING, CHECKED = "graspq, streaming", "graspq, streaming, SHA-256 of all files first"
 IN_MEMORY = "graspq, all in the buffer, first epoch"
 PNG = "PNG files, PyTorch DataLoader"
-RIVALS: dict[str, Callable[[rivals.Frames, Path, int, int], rivals.Epoch]] = {
-    PNG: rivals.png_files,
-    "Hugging Face datasets, map-style": rivals.hugging_face_map,
-    "Hugging Face datasets, streaming": rivals.hugging_face_stream,
-    "LeRobot-style random access": rivals.lerobot_style,
+HF_MAP, HF_STREAM = "Hugging Face datasets, map-style", "Hugging Face datasets, streaming"
+LEROBOT = "LeRobot-style random access"
+RIVALS: dict[str, Callable[[rivals.Frames, Path, int], rivals.Epoch]] = {
+    PNG: rivals.shuffled(rivals.PngFiles),
+    HF_MAP: rivals.shuffled(rivals.MapStyleRows),
+    HF_STREAM: rivals.hugging_face_stream,
+    LEROBOT: rivals.shuffled(rivals.LeRobotRows),
 }
-CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
-class LoadingSettings(TrainingSpeedSettings):
+class LoadingSettings(DataSettings):
     """Settings of this benchmark."""
 
-    batch_size: int = setting(256, help="Transitions of a batch.", minimum=2)
-    workers: int = setting(2, help="Worker processes of each rival.", minimum=0)
+    batch_size: int = setting(BATCH_SIZE, help="Transitions of a batch.", minimum=2)
     rival_batches: int | None = setting(None, help="The rivals' batches; an epoch if not given.", minimum=1)
-    scratch: Path | None = setting(None, help="Folder to keep the rivals' copies of the data in.")
 
 
 def larger(pool: ShardPool, batch_size: int) -> tuple[ShardPool, int]:
@@ -62,30 +63,17 @@ def larger(pool: ShardPool, batch_size: int) -> tuple[ShardPool, int]:
     raise AssertionError
 
 
-def consume(batches: Iterable[Any], count: int, slack: int = 0) -> None:
-    """Take `count` batches.
-
-    Raises:
-        UserError: the epoch lacks more than `slack` of them.
-    """
-    taken = sum(1 for _ in itertools.islice(batches, count))
+def consume(epoch: Callable[[], Iterable[Any]], count: int, slack: int = 0) -> None:
+    """Take `count` batches of a new epoch; `UserError` where it lacks more than `slack` of them."""
+    taken = sum(1 for _ in itertools.islice(epoch(), count))
     if taken < count - slack:
         raise UserError(f"a rival's epoch ended after {taken} batches, expected {count}: ask for fewer")
 
 
-def epoch_of(epoch: rivals.Epoch, batches: int, slack: int) -> Callable[[], None]:
-    """Return what takes so many batches of a rival's epoch."""
-    return lambda: consume(epoch(), batches, slack)
-
-
-def ours(open_pool: Callable[[], ShardPool], batch_size: int, batches: int, buffer_bytes: int) -> Callable[[], None]:
-    """Return what opens a pool and takes so many batches with s' from it as tensors."""
-
-    def read() -> None:
-        with TransitionLoader(open_pool(), batch_size, 0, buffer_bytes) as loader:
-            consume((to_tensors(batch, CPU) for batch in loader), batches)
-
-    return read
+def ours(open_pool: Callable[[], ShardPool], batch_size: int, batches: int, buffer_bytes: int) -> None:
+    """Open a pool and take so many batches with s' from it as tensors."""
+    with open_pool().batches(batch_size, buffer_bytes=buffer_bytes) as loader:
+        consume(lambda: (to_tensors(batch, CPU) for batch in loader), batches)
 
 
 def known(frames: rivals.Frames) -> dict[tuple[int, bytes], int]:
@@ -96,11 +84,7 @@ def known(frames: rivals.Frames) -> dict[tuple[int, bytes], int]:
 
 
 def check(name: str, epoch: rivals.Epoch, transitions: dict[tuple[int, bytes], int]) -> None:
-    """Refuse a rival whose first batch is not of transitions of the data.
-
-    Raises:
-        UserError: it is not.
-    """
+    """Refuse a rival whose first batch is not of transitions of the data (`UserError`)."""
 
     def checksum(picture: torch.Tensor) -> int:
         if picture.is_floating_point():
@@ -114,50 +98,44 @@ def check(name: str, epoch: rivals.Epoch, transitions: dict[tuple[int, bytes], i
             raise UserError(f"{name}: gives a transition that is not in the data")
 
 
-def rival_runs(pool: ShardPool, folder: Path, batches: int, settings: LoadingSettings) -> dict[str, Callable[[], None]]:
-    """Make the rivals' copies of the data and return what reads `batches` of them."""
-    frames = rivals.Frames(pool)
-    transitions = known(frames)
-    runs: dict[str, Callable[[], None]] = {}
-    for name, make in RIVALS.items():
-        try:
-            epoch = make(frames, folder / name.replace(" ", "-"), settings.batch_size, settings.workers)
-        except ImportError as error:
-            click.echo(f"{name}: left out ({error})", err=True)
-            continue
-        check(name, epoch, transitions)
-        # Each worker's last batch may be too small to count.
-        runs[name] = epoch_of(epoch, batches, settings.workers)
-    return runs
-
-
 def measure(settings: LoadingSettings) -> Result:
     """Return samples a second of ours and of the rivals."""
-    pool = open_shards(settings.shards)
-    size = settings.batch_size
+    pool, size = open_shards(settings.shards), settings.batch_size
     batches = pool.rows // size
-    rival_batches = settings.rival_batches or batches
     wide, buffer_bytes = larger(pool, size)
-    runs = {
-        STREAMING: ours(lambda: wide, size, batches, buffer_bytes),
-        CHECKED: ours(lambda: larger(open_shards(settings.shards), size)[0], size, batches, buffer_bytes),
-        IN_MEMORY: ours(lambda: pool, size, batches, 2 * pool.rows * pool.row_bytes),
+    readers = {
+        STREAMING: partial(ours, lambda: wide, size, batches, buffer_bytes),
+        CHECKED: partial(ours, lambda: larger(open_shards(settings.shards), size)[0], size, batches, buffer_bytes),
+        IN_MEMORY: partial(ours, lambda: pool, size, batches, 2 * pool.rows * pool.row_bytes),
     }
-    counts = dict.fromkeys(runs, size * batches) | dict.fromkeys(RIVALS, size * rival_batches)
-    with tempfile.TemporaryDirectory(prefix="graspq-loading-") as temporary:
-        runs |= rival_runs(pool, settings.scratch or Path(temporary), rival_batches, settings)
-        seconds = take_turns(runs, settings.turns)
-    rows, times = compared("loader", "samples", seconds, counts, PNG)
+    arms = {name: timed(read, size * batches) for name, read in readers.items()}
+    frames, rival_batches = rivals.Frames(pool), settings.rival_batches or batches
+    transitions = known(frames)
+    with tempfile.TemporaryDirectory(prefix="graspq-loading-") as scratch:
+        for name, make in RIVALS.items():
+            try:
+                epoch = make(frames, Path(scratch) / name.replace(" ", "-"), size)
+            except ImportError as error:
+                click.echo(f"{name}: left out ({error})", err=True)
+                continue
+            check(name, epoch, transitions)
+            # Each worker's last batch may be too small to count.
+            arms[name] = timed(partial(consume, epoch, rival_batches, rivals.WORKERS), size * rival_batches)
+        seconds = take_turns(arms, settings.turns)
+
+    def times(name: str) -> float | None:
+        return median_ratio(seconds[PNG], seconds[name]) if name in seconds else None
+
     return Result(
         [
-            Ratio("shuffled transitions from disk, against PNG + `DataLoader`", times[STREAMING], bar=10, aim=30),
-            Ratio("… every file's SHA-256 checked first", times[CHECKED]),
-            Ratio("… with all data in the buffer, first epoch", times[IN_MEMORY], bar=10, aim=30),
-            Ratio("Hugging Face `datasets`, map-style", times.get("Hugging Face datasets, map-style")),
-            Ratio("Hugging Face `datasets`, streaming", times.get("Hugging Face datasets, streaming")),
-            Ratio("LeRobot-style random access", times.get("LeRobot-style random access")),
+            Ratio("shuffled transitions from disk, against PNG + `DataLoader`", times(STREAMING), bar=10, aim=30),
+            Ratio("… every file's SHA-256 checked first", times(CHECKED)),
+            Ratio("… with all data in the buffer, first epoch", times(IN_MEMORY), bar=10, aim=30),
+            Ratio("Hugging Face `datasets`, map-style", times(HF_MAP)),
+            Ratio("Hugging Face `datasets`, streaming", times(HF_STREAM)),
+            Ratio("LeRobot-style random access", times(LEROBOT)),
         ],
-        {"Loading shuffled transitions with s' from disk": rows},
+        {"Loading shuffled transitions with s' from disk": compared("loader", "sample", seconds, PNG)},
         {"streaming buffer, bytes": buffer_bytes},
     )
 

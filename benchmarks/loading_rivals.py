@@ -24,6 +24,7 @@ Batch = dict[str, Tensor]
 Epoch = Callable[[], Iterable[Batch]]
 LABELS = ("action", "reward", "terminal", "step", "mc_return")
 SHUFFLE_BUFFER = 10_000
+WORKERS = 2  # processes of each rival
 
 
 class Frames:
@@ -35,11 +36,16 @@ class Frames:
         self.columns = {name: np.concatenate([block[name] for block in records]) for name in LABELS}
         terminal = self.columns["terminal"].astype(bool)
         self.next_row = np.arange(len(terminal)) + ~terminal
+        self.files = [str(path) for path in dict.fromkeys(ref.path for ref in pool.blocks)]
 
     def pictures(self) -> Iterator[npt.NDArray[np.uint8]]:
         """Yield the pictures, uint8 [H, W, C], in the order of the rows."""
         for ref in self.pool.blocks:
             yield from self.pool.read_block(ref).images
+
+    def stacked(self, pictures: list[bytes]) -> Tensor:
+        """Return pictures, given as raw bytes, as uint8 [B, H, W, C]."""
+        return torch.from_numpy(np.frombuffer(b"".join(pictures), np.uint8).reshape(-1, *self.pool.image_shape).copy())
 
 
 def as_png(picture: npt.NDArray[np.uint8]) -> bytes:
@@ -49,6 +55,29 @@ def as_png(picture: npt.NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
+def shuffled(copy: Callable[[Frames, Path], Dataset[Batch]]) -> Callable[[Frames, Path, int], Epoch]:
+    """Return what reads a copy of the data by PyTorch's own `DataLoader`, shuffled over all rows."""
+
+    def epoch_of(frames: Frames, folder: Path, batch_size: int) -> Epoch:
+        dataset = copy(frames, folder)
+        collate = getattr(dataset, "collate", None)
+        return lambda: DataLoader(dataset, batch_size, True, num_workers=WORKERS, drop_last=True, collate_fn=collate)
+
+    return epoch_of
+
+
+def hugging_face() -> Any:
+    """Return Hugging Face's `datasets`, without bars of progress.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    import datasets
+
+    datasets.disable_progress_bars()
+    return datasets
+
+
 class PngFiles(Dataset[Batch]):
     """PNG files, one a frame, a thousand in a folder; s' is the next file."""
 
@@ -56,8 +85,7 @@ class PngFiles(Dataset[Batch]):
         self.frames, self.folder = frames, folder
         for row, picture in enumerate(frames.pictures()):
             self._path(row).parent.mkdir(parents=True, exist_ok=True)
-            if not self._path(row).exists():
-                self._path(row).write_bytes(as_png(picture))
+            self._path(row).write_bytes(as_png(picture))
 
     def _path(self, row: int) -> Path:
         return self.folder / f"{row // 1000:04d}" / f"{row:07d}.png"
@@ -74,55 +102,26 @@ class PngFiles(Dataset[Batch]):
         return pictures | {name: torch.as_tensor(values[row]) for name, values in self.frames.columns.items()}
 
 
-def shuffled(dataset: Dataset[Batch], batch_size: int, workers: int, **more: Any) -> Epoch:
-    """Return an epoch's factory: PyTorch's own `DataLoader`, shuffled over all rows."""
-    return lambda: DataLoader(dataset, batch_size, shuffle=True, num_workers=workers, drop_last=True, **more)
-
-
-def png_files(frames: Frames, folder: Path, batch_size: int, workers: int) -> Epoch:
-    """PNG files with PyTorch's own loader."""
-    return shuffled(PngFiles(frames, folder), batch_size, workers)
-
-
-def shard_files(pool: ShardPool) -> list[str]:
-    """Return the files of a pool's steps."""
-    return [str(path) for path in dict.fromkeys(ref.path for ref in pool.blocks)]
-
-
-def stacked(pictures: list[bytes], shape: tuple[int, int, int]) -> Tensor:
-    """Return pictures, given as raw bytes, as uint8 [B, H, W, C]."""
-    return torch.from_numpy(np.frombuffer(b"".join(pictures), np.uint8).reshape(-1, *shape).copy())
-
-
 class MapStyleRows(Dataset[Batch]):
     """The memory-mapped copy that Hugging Face's `load_dataset` makes of Parquet files.
 
     `__getitems__` fetches a whole batch at once, as their `DataLoader` guide advises.
     """
 
-    def __init__(self, rows: Any, frames: Frames) -> None:
+    def __init__(self, frames: Frames, folder: Path) -> None:
+        rows = hugging_face().load_dataset("parquet", data_files=frames.files, split="train", cache_dir=str(folder))
         self.rows, self.images = rows.select_columns(["image", *LABELS]), rows.select_columns(["image"])
-        self.next_row, self.shape = frames.next_row, frames.pool.image_shape
+        self.frames, self.collate = frames, lambda batch: batch
 
     def __len__(self) -> int:
-        return len(self.next_row)
+        return len(self.frames.next_row)
 
     def __getitems__(self, indices: list[int]) -> Batch:
         """Return a batch."""
-        batch, following = self.rows[indices], self.images[self.next_row[indices].tolist()]
+        batch, following = self.rows[indices], self.images[self.frames.next_row[indices].tolist()]
         labels = {name: torch.as_tensor(np.asarray(batch[name])) for name in LABELS}
         pictures = {"image": batch["image"], "next_image": following["image"]}
-        return labels | {name: stacked(values, self.shape) for name, values in pictures.items()}
-
-
-def hugging_face_map(frames: Frames, folder: Path, batch_size: int, workers: int) -> Epoch:
-    """Hugging Face `datasets`, map-style, on the pool's Parquet files."""
-    import datasets
-
-    datasets.disable_progress_bars()
-    files = shard_files(frames.pool)
-    rows = datasets.load_dataset("parquet", data_files=files, split="train", cache_dir=str(folder))
-    return shuffled(MapStyleRows(rows, frames), batch_size, workers, collate_fn=lambda batch: batch)
+        return labels | {name: self.frames.stacked(values) for name, values in pictures.items()}
 
 
 class Pairs:
@@ -145,21 +144,18 @@ class Pairs:
         return {name: [values[row] for row in rows] for name, values in batch.items()} | {"next_image": following}
 
 
-def hugging_face_stream(frames: Frames, folder: Path, batch_size: int, workers: int) -> Epoch:
+def hugging_face_stream(frames: Frames, folder: Path, batch_size: int) -> Epoch:
     """Hugging Face `datasets`, streamed from the pool's Parquet files through a shuffle buffer."""
-    import datasets
-
-    datasets.disable_progress_bars()
-    files, shape = shard_files(frames.pool), frames.pool.image_shape
+    datasets, files = hugging_face(), frames.files
 
     def collate(rows: list[dict[str, Any]]) -> Batch:
         labels = {name: torch.as_tensor(np.asarray([row[name] for row in rows])) for name in LABELS}
-        return labels | {name: stacked([row[name] for row in rows], shape) for name in ("image", "next_image")}
+        return labels | {name: frames.stacked([row[name] for row in rows]) for name in ("image", "next_image")}
 
     def epoch() -> Iterable[Batch]:
         stream = datasets.load_dataset("parquet", data_files=files, split="train", streaming=True)
-        stream = stream.map(Pairs(), batched=True).shuffle(seed=0, buffer_size=SHUFFLE_BUFFER // max(workers, 1))
-        return DataLoader(stream, batch_size, num_workers=min(workers, len(files)), drop_last=True, collate_fn=collate)
+        stream = stream.map(Pairs(), batched=True).shuffle(seed=0, buffer_size=SHUFFLE_BUFFER // max(WORKERS, 1))
+        return DataLoader(stream, batch_size, num_workers=min(WORKERS, len(files)), drop_last=True, collate_fn=collate)
 
     return epoch
 
@@ -174,16 +170,12 @@ class LeRobotRows(Dataset[Batch]):
     """
 
     def __init__(self, frames: Frames, folder: Path) -> None:
-        import datasets
-
-        datasets.disable_progress_bars()
-        self.next_row = frames.next_row
-        path = folder / "file-000.parquet"
-        if not path.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            columns = {name: pa.array(list(values)) for name, values in frames.columns.items()}
-            pq.write_table(pa.table({"image": pa.array(map(as_png, frames.pictures())), **columns}), path)
+        datasets, path = hugging_face(), folder / "file-000.parquet"
+        folder.mkdir(parents=True, exist_ok=True)
+        columns = {name: pa.array(list(values)) for name, values in frames.columns.items()}
+        pq.write_table(pa.table({"image": pa.array(map(as_png, frames.pictures())), **columns}), path)
         rows = datasets.Dataset.from_parquet(str(path), cache_dir=str(folder / "cache"))
+        self.next_row = frames.next_row
         self.rows = rows.cast_column("image", datasets.Image())
         self.images = self.rows.select_columns(["image"])
         self.rows.set_transform(to_tensors)
@@ -206,8 +198,3 @@ def to_tensors(batch: dict[str, list[Any]]) -> dict[str, list[Tensor]]:
         return torch.from_numpy(np.array(value)).permute(2, 0, 1).contiguous().float().div(255)
 
     return {name: [tensor(value) for value in values] for name, values in batch.items()}
-
-
-def lerobot_style(frames: Frames, folder: Path, batch_size: int, workers: int) -> Epoch:
-    """LeRobot-style random access with PyTorch's own loader."""
-    return shuffled(LeRobotRows(frames, folder), batch_size, workers)

@@ -17,18 +17,10 @@ from graspq.train.networks.network import QNetwork
 from graspq.train.settings import TrainSettings
 
 
-class ConvNorm(nn.Module):
-    """A convolution without bias, then batch normalisation."""
-
-    def __init__(self, inputs: int, outputs: int, size: int, stride: int = 1) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, size, stride=stride, padding=size // 2, bias=False)
-        self.norm = nn.BatchNorm2d(outputs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return [B, C', H', W'] of [B, C, H, W]."""
-        normed: Tensor = self.norm(self.conv(x))
-        return normed
+def conv_norm(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
+    """Return a convolution without bias, then batch normalisation."""
+    conv = nn.Conv2d(inputs, outputs, size, stride=stride, padding=size // 2, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outputs))
 
 
 class PlainNetwork(nn.Module):
@@ -37,12 +29,12 @@ class PlainNetwork(nn.Module):
     def __init__(self, last_step: int, actions: int = 4) -> None:
         super().__init__()
         self.last_step = last_step
-        self.stem = ConvNorm(3, 16, 3, stride=2)
-        self.reduce = ConvNorm(16, 64, 3, stride=2)
-        self.fine = ConvNorm(64, 64, 3)
-        self.coarse1 = ConvNorm(64, 64, 3)
-        self.coarse2 = ConvNorm(64, 64, 3)
-        self.squeeze = ConvNorm(64, 32, 1)
+        self.stem = conv_norm(3, 16, 3, stride=2)
+        self.reduce = conv_norm(16, 64, 3, stride=2)
+        self.fine = conv_norm(64, 64, 3)
+        self.coarse1 = conv_norm(64, 64, 3)
+        self.coarse2 = conv_norm(64, 64, 3)
+        self.squeeze = conv_norm(64, 32, 1)
         self.heat = nn.Conv2d(64, 16, 1)
         self.state = nn.Linear(32 * 8 * 8, 256)
         self.points_to_state = nn.Linear(32, 256, bias=False)
@@ -60,10 +52,7 @@ class PlainNetwork(nn.Module):
     def forward(self, image: Tensor, step: Tensor, action: Tensor) -> Tensor:
         """Return Q before its logistic function, float32 [B].
 
-        Args:
-            image: float32 [B, C, H, W], 0 to 255.
-            step: int64 [B].
-            action: float32 [B, A].
+        `image` is float32 [B, C, H, W], 0 to 255; `step` int64 [B]; `action` float32 [B, A].
         """
         return self.of_actions(self.trunk(image, step), action.unsqueeze(1)).squeeze(1)
 
@@ -114,25 +103,14 @@ RENAMED = {
     "encoder.keypoints.heat": "heat",
     "encoder.": "",
 }
-CONVOLUTIONS = ("stem", "reduce", "fine", "coarse1", "coarse2", "squeeze")
 
 
 def plain_copy(network: QNetwork, last_step: int) -> PlainNetwork:
     """Return a plain network with the weights of ours, contiguous in memory."""
-    plain = PlainNetwork(last_step)
-    state = {}
+    plain, state = PlainNetwork(last_step), {}
     for name, tensor in network.state_dict().items():
-        ours = name
-        for old, new in RENAMED.items():
-            if name.startswith(old):
-                name = new + name.removeprefix(old)
-                break
-        part, _, rest = name.partition(".")
-        if part in CONVOLUTIONS:
-            name = f"{part}.{'conv' if rest.startswith('0.') else 'norm'}.{rest[2:]}"
-        if name not in plain.state_dict():
-            raise KeyError(f"{ours}: the plain network has no {name}")
-        state[name] = tensor.detach().clone().contiguous()
+        old = next((old for old in RENAMED if name.startswith(old)), "")
+        state[RENAMED.get(old, "") + name.removeprefix(old)] = tensor.detach().clone().contiguous()
     plain.load_state_dict(state)
     return plain
 
@@ -142,12 +120,7 @@ def augmented(
 ) -> tuple[Tensor, Tensor]:
     """Return pictures padded with their border, cropped and mirrored one by one, and their actions.
 
-    Args:
-        image: uint8 [B, C, H, W].
-        action: float32 [B, 4].
-        shifts: rows and columns that each picture is moved by, -margin to margin.
-        mirrored: which are mirrored.
-        margin: pixels of padding.
+    `image` is uint8 [B, C, H, W]; `shifts` are rows and columns that each is moved by, from -`margin` to `margin`.
     """
     height, width = image.shape[2:]
     images, actions = [], []
@@ -181,7 +154,7 @@ class PlainTraining:
         self.optimizer = torch.optim.AdamW(groups, lr=settings.learning_rate, foreach=False, fused=False)
         self.step = 0
 
-    def update(self, batch: dict[str, Tensor]) -> Tensor:
+    def update(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Take one gradient step; return the loss."""
         margin, rows = self.settings.shift, len(batch["action"])
         shifts = [[random.randint(-margin, margin), random.randint(-margin, margin)] for _ in range(rows)]
@@ -198,7 +171,7 @@ class PlainTraining:
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.follow()
-        return loss
+        return {"loss": loss}
 
     @torch.no_grad()
     def double_q(self, batch: dict[str, Tensor], next_image: Tensor, candidates: Tensor, discount: float) -> Tensor:

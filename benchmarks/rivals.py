@@ -27,18 +27,12 @@ def tiled(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
     return q_of_actions
 
 
-def anew(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
-    """Return Q of candidates by a trunk that runs again at every call."""
-    return lambda action: network.at(image, step)(action)
-
-
-def once(network: QNetwork, image: Tensor, step: Tensor) -> QOfActions:
-    """Return Q of candidates by a trunk that runs once, as we do."""
-    return network.at(image, step)
-
-
 TILED, ANEW, ONCE = "64 tiled copies", "trunk each iteration", "trunk once"
-WAYS: dict[str, Way] = {TILED: tiled, ANEW: anew, ONCE: once}
+WAYS: dict[str, Way] = {
+    TILED: tiled,
+    ANEW: lambda network, image, step: lambda action: network.at(image, step)(action),
+    ONCE: lambda network, image, step: network.at(image, step),  # as we do
+}
 
 
 class Asked(nn.Module):

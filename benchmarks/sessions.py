@@ -3,33 +3,33 @@
 import contextlib
 import itertools
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from graspq.benchmarks.measuring import TrainingSpeedSettings
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.batches import training_batches
 from graspq.train.loop import Session, session
-from graspq.train.settings import complete
+from graspq.train.settings import Preset, complete
 
 CPU = torch.device("cpu")
 B = TypeVar("B")
 
 
 @contextlib.contextmanager
-def training_of(algo: str, pool: ShardPool, settings: TrainingSpeedSettings, **options: Any) -> Iterator[Session]:
-    """Give a new training with default options in a temporary folder, on all but a twentieth of a pool."""
+def training_of(
+    algo: str, shards: Sequence[str], pool: ShardPool, preset: Preset = "default", **options: Any
+) -> Iterator[Session]:
+    """Give a new training in a temporary folder, on all but a twentieth of the pool that was opened from the shards."""
     with tempfile.TemporaryDirectory(prefix="graspq-training-") as folder:
-        given = {"algo": algo, "shards": settings.shards, "out": Path(folder) / "run", "threads": settings.threads}
+        given = {"algo": algo, "shards": tuple(shards), "out": Path(folder) / "run", "device": "cpu", **options}
         # The actor of ddpg is at work in most of a training, but for its rest at the start.
         given |= {"actor_rest": 0.0} if algo == "ddpg" else {}
-        training, held_back = pool.split(0.05, 0)
-        with session(complete({**given, "device": "cpu", **options}), pool, training, held_back) as current:
+        with session(complete(given, preset), pool, *pool.split(0.05, 0)) as current:
             yield current
 
 
@@ -48,17 +48,12 @@ def ready(current: Session, pool: ShardPool, count: int) -> list[Batch]:
         return list(itertools.islice(batches, count))
 
 
-def steps_on(batches: Sequence[B], update: Callable[[B], Tensor]) -> Callable[[], None]:
-    """Return what takes one step on each batch and waits until it is done; `update` returns the loss."""
+def steps_on(batches: Sequence[B], update: Callable[[B], Mapping[str, Tensor]]) -> Callable[[], None]:
+    """Return what takes one step on each batch and waits until it is done; `update` returns the `loss`."""
 
     def take_steps() -> None:
         for batch in batches:
-            loss = update(batch)
-        loss.item()
+            measured = update(batch)
+        measured["loss"].item()
 
     return take_steps
-
-
-def update_of(current: Session) -> Callable[[Batch], Tensor]:
-    """Return what takes a step of a training and returns its loss."""
-    return lambda batch: current.update(batch)["loss"]

@@ -3,48 +3,48 @@
 python benchmarks/training.py --shards data/regular-10k
 """
 
-import contextlib
 import copy
 import dataclasses
 import random
-import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from graspq.benchmarks.d3rlpy_rival import update_by_d3rlpy
-from graspq.benchmarks.measuring import (
+from graspq.benchmarks.harness import (
+    DataSettings,
     Ratio,
     Result,
     Row,
-    TrainingSpeedSettings,
+    check_equal,
     command,
     compared,
-    greatest_difference,
+    median_ratio,
     take_turns,
+    timed,
 )
 from graspq.benchmarks.plain_pytorch import PlainTraining, augmented, plain_copy
-from graspq.benchmarks.sessions import CPU, ready, steps_on, training_of, update_of
+from graspq.benchmarks.sessions import CPU, ready, steps_on, training_of
+from graspq.benchmarks.stopwatch import Stopwatch
 from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
-from graspq.train import augment
+from graspq.train import augment, estimator, loop
 from graspq.train.batch import Batch
 from graspq.train.device import Precision
-from graspq.train.estimator import loss_of, targets_of
+from graspq.train.estimator import targets_of
 from graspq.train.loop import Session
 from graspq.train.selection import uniform_actions
-from graspq.train.state import advance, seeded
+from graspq.train.state import seeded
 
 OURS, PLAIN, TILED, D3RLPY = "graspq", "plain PyTorch", "plain PyTorch, 16 tiled copies", "d3rlpy"
-Runs = dict[str, tuple[Callable[[], None], int]]  # what runs, and how many transitions it trains on
 
 
 @dataclass(frozen=True)
-class TrainingSettings(TrainingSpeedSettings):
+class TrainingSettings(DataSettings):
     """Settings of this benchmark."""
 
     steps: int = setting(4, help="Steps of each in a turn; plain dql with tiled copies: one.", minimum=1)
@@ -60,11 +60,7 @@ def plain_batch(batch: Batch) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> None:
-    """Refuse a rival whose pictures, Q (in evaluation and in training mode) or target are others, in float32.
-
-    Raises:
-        UserError: it computes something else.
-    """
+    """Refuse a rival whose pictures, Q (in evaluation and in training mode) or target are others (`UserError`)."""
     settings, rows, networks = current.settings, len(batch.action), current.state.networks
     shifts = torch.randint(-settings.shift, settings.shift + 1, (rows, 2), generator=seeded("benchmarks/agreement"))
     mirrored, mirror = [True, False] * (rows // 2) + [True] * (rows % 2), networks.specification.action.mirror
@@ -81,96 +77,75 @@ def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> Non
     for mode in (False, True):
         ours = network.value_of(network.train(mode)(image.squeeze(1), step, action))
         asked = network.value_of(plain_network.train(mode)(plain_image, step, action))
-        greatest_difference(ours, {f"Q of plain {settings.algo}": asked})
+        check_equal(ours, {f"Q of plain {settings.algo}": asked})
     if plain.dql is not None:
         precise = dataclasses.replace(networks, precision=Precision("float32", CPU))
         networks.q.eval()
         target = targets_of(settings.row, batch, precise, settings.own, seeded("benchmarks/candidates"), 0.0)
         candidates = uniform_actions(seeded("benchmarks/candidates"), rows, plain.dql.candidates, action.shape[1])
         asked = plain.double_q(theirs, theirs["next_image"].float(), candidates, plain.dql.discount)
-        greatest_difference(target, {"the target of plain dql": asked})
+        check_equal(target, {"the target of plain dql": asked})
 
 
-def rivals_of(current: Session, batches: Sequence[Batch]) -> Runs:
-    """Return ours and its rivals for one estimator."""
-    size, theirs = len(batches[0].action), [plain_batch(batch) for batch in batches]
-    runs: Runs = {OURS: (steps_on(batches, update_of(current)), size * len(batches))}
-    if current.settings.algo == "ddpg":
+def rivals_of(current: Session, batches: Sequence[Batch]) -> dict[str, Callable[[int], float]]:
+    """Return what trains ours and its rivals for one estimator; of each the seconds of a transition."""
+    algo, size, theirs = current.settings.algo, len(batches[0].action), [plain_batch(batch) for batch in batches]
+    arms = {OURS: timed(steps_on(batches, current.update), size * len(batches))}
+    if algo == "ddpg":
         update = update_by_d3rlpy(theirs)
-        return runs if update is None else runs | {D3RLPY: (update, size * len(batches))}
-    for name in (PLAIN, TILED) if current.settings.algo == "dql" else (PLAIN,):
+        return arms if update is None else arms | {D3RLPY: timed(update, size * len(batches))}
+    for name in (PLAIN, TILED) if algo == "dql" else (PLAIN,):
         copied = plain_copy(current.state.networks.q, current.state.networks.specification.steps - 1)
         plain = PlainTraining(copied, current.settings, tiled=name == TILED)
         check_agreement(current, plain, batches[0])
         taken = theirs[:1] if name == TILED else theirs  # sixteen copies of every picture take seconds
-        runs[name] = steps_on(taken, plain.update), size * len(taken)
-    return runs
+        arms[name] = timed(steps_on(taken, plain.update), size * len(taken))
+    return arms
 
 
 def pieces_row(current: Session, batches: Sequence[Batch]) -> Row:
-    """Return the medians of the pieces of a step, taken apart as `Session.update` does them, in milliseconds."""
-    seconds: dict[str, list[float]] = {}
-
-    @contextlib.contextmanager
-    def timed(piece: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        seconds.setdefault(piece, []).append(time.perf_counter() - start)
-
-    settings, state, row = current.settings, current.state, current.settings.row
-    networks, mirror = state.networks, state.networks.specification.action.mirror
-    for batch in batches:
-        with timed("augmentation"):
-            changed = augment.augmented(batch, settings.shift, mirror, seeded("benchmarks/augment", state.step))
-        networks.q.eval()
-        with timed("target"):
-            numbers = seeded("benchmarks/candidates", state.step)
-            target = targets_of(row, changed, networks, settings.own, numbers, 0.0)
-        networks.q.train()
-        with timed("forward"):
-            loss = loss_of(row, changed, target, networks, settings.own)["loss"]
-        state.optimizers["q"].zero_grad(set_to_none=True)
-        with timed("backward"):
-            loss.backward()  # type: ignore[no-untyped-call]
-        with timed("optimiser"):
-            state.optimizers["q"].step()
-        with timed("averages"):
-            advance(state, settings.average_decay, getattr(settings.own, "lag_steps", None))
-        with timed("step"):
-            current.update(batch)
-    # The first batch warms up.
-    median = {piece: 1e3 * statistics.median(values[1:]) for piece, values in seconds.items()}
-    step, network = median.pop("step"), median["forward"] + median["backward"]
+    """Return the mean milliseconds of the pieces of a step, over batches that are trained on once before."""
+    train = steps_on(batches, current.update)
+    train()
+    with Stopwatch("rest", time.perf_counter) as watch:
+        for owner, name, piece in (
+            (loop, "augmented", "augmentation"),
+            (estimator, "targets_of", "target"),
+            (estimator, "loss_of", "forward"),
+            (Tensor, "backward", "backward"),
+            (current.state.optimizers["q"], "step", "optimiser"),
+            (loop, "advance", "averages"),
+        ):
+            watch.wrap(owner, name, phase=piece)
+        train()
+    spent = {piece: 1e3 * seconds / len(batches) for (piece, _), seconds in watch.seconds.items() if piece != "rest"}
+    step = 1e3 * sum(watch.seconds.values()) / len(batches)
+    network = spent["forward"] + spent["backward"]
     return {
-        "estimator": settings.algo,
+        "estimator": current.settings.algo,
         "step (ms)": step,
-        **{f"{piece} (ms)": value for piece, value in median.items()},
+        **{f"{piece} (ms)": value for piece, value in spent.items()},
         "share of forward and backward": f"{network / step:.0%}",
-        "share of forward, backward and target": f"{(network + median['target']) / step:.0%}",
+        "share of forward, backward and target": f"{(network + spent['target']) / step:.0%}",
     }
 
 
 def measure(settings: TrainingSettings) -> Result:
     """Return transitions a second of training, and where a step's time goes."""
-    pool = open_shards(settings.shards)
+    pool, rows, pieces = open_shards(settings.shards), list[Row](), list[Row]()
     random.seed(0)
     torch.manual_seed(0)
-    rows: list[Row] = []
-    pieces: list[Row] = []
     faster: dict[tuple[str, str], float] = {}
     # One estimator after the other: a turn of ours and one of its rival then lie within seconds of each other.
     for algo in ("mc", "dql", "ddpg"):
-        with training_of(algo, pool, settings) as current:
+        with training_of(algo, settings.shards, pool) as current:
             batches = ready(current, pool, settings.steps)
-            runs = rivals_of(current, batches)
-            seconds = take_turns({name: run for name, (run, _) in runs.items()}, settings.turns)
-            counts = {name: count for name, (_, count) in runs.items()}
-            found, times = compared("training", "transitions", seconds, counts, OURS)
+            seconds = take_turns(rivals_of(current, batches), settings.turns)
             if algo != "ddpg":
-                pieces.append(pieces_row(current, batches[:1] + batches * settings.turns))
+                pieces.append(pieces_row(current, batches * settings.turns))
             precision = current.state.networks.precision.name
-        rows += [{**row, "training": f"{algo}, {row['training']}"} for row in found]
-        faster |= {(algo, name): 1 / value for name, value in times.items()}
+        rows += [{"estimator": algo, **row} for row in compared("training", "transition", seconds, OURS)]
+        faster |= {(algo, name): median_ratio(values, seconds[OURS]) for name, values in seconds.items()}
     tiled = "… of `dql`, the plain one with a copy of the picture for every candidate"
     return Result(
         [

@@ -1,23 +1,27 @@
 """Batches as the learner sees them: transitions (s, a, r, s′) and whole episodes padded to T with a mask.
 
-A state is the image and `step`. Dimension key: B batch, T steps, A action, H W C image.
+They are gathered from blocks in memory: the only copy between the Parquet reader and the learner. A state is the image
+and `step`. Dimension key: B batch, T steps, A action, H W C image.
 """
 
 import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
+from graspq.datasets.blocks import BlockArrays, Records, opaque
 from graspq.datasets.columns import batch_columns
-from graspq.datasets.episode import Float32, UInt8
+from graspq.datasets.episode import Float32, Int64, UInt8
 
 if TYPE_CHECKING:
     import torch
 
-Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
-Records = npt.NDArray[Any]
+Blocks = Mapping[int, BlockArrays]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,24 +103,64 @@ class EpisodeBatch(Samples):
 NAMED = {field.name for field in dataclasses.fields(Samples)}
 
 
-def transition_batch(image: UInt8, next_image: UInt8 | None, records: Records) -> TransitionBatch:
-    """Return the batch of B gathered records and images; `records` is [B] of `columns.record_dtype`."""
-    columns = _split(records)
+def gather_transitions(
+    blocks: Blocks, owners: Sequence[int], rows: Sequence[int], *, need_next: bool
+) -> TransitionBatch:
+    """Return the batch of row `rows[i]` of block `owners[i]`, for all i."""
+    shape = blocks[owners[0]].images.shape[1:]
+    image = _room((len(rows), *shape))
+    next_image = _room((len(rows), *shape)) if need_next else None
+    records = np.empty(len(rows), blocks[owners[0]].records.dtype)
+    copied = opaque(records)
+    for index, (owner, row) in enumerate(zip(owners, rows, strict=True)):
+        block = blocks[owner]
+        image[index] = block.images[row]
+        if next_image is not None:
+            next_image[index] = block.images[block.next_rows[row]]
+        copied[index] = block.opaque[row]
+    columns = _columns(records)
     next_step = columns["step"] + ~columns["terminal"]
     return TransitionBatch(image=image, next_image=next_image, next_step=next_step, **columns)
 
 
-def episode_batch(image: UInt8, records: Records, mask: Bool) -> EpisodeBatch:
-    """Return the batch of B gathered, padded episodes; `records` is [B, T] of `columns.record_dtype`."""
-    columns = _split(records)
-    columns["step"][:] = np.arange(mask.shape[1])
+def gather_episodes(blocks: Blocks, owners: Sequence[int], numbers: Sequence[int], *, max_steps: int) -> EpisodeBatch:
+    """Return the batch of episode `numbers[i]` of block `owners[i]`, for all i, padded to `max_steps`.
+
+    Raises:
+        ValueError: an episode is longer.
+    """
+    shape = blocks[owners[0]].images.shape[1:]
+    image = _room((len(numbers), max_steps, *shape))
+    records = np.zeros((len(numbers), max_steps), blocks[owners[0]].records.dtype)
+    copied = opaque(records)
+    mask = np.zeros((len(numbers), max_steps), np.bool_)
+    for index, (owner, number) in enumerate(zip(owners, numbers, strict=True)):
+        block = blocks[owner]
+        first, length = int(block.first_rows[number]), int(block.lengths[number])
+        if length > max_steps:
+            raise ValueError(f"max_steps: expected at least {length}, the length of an episode, got {max_steps}")
+        image[index, :length] = block.images[first : first + length]
+        image[index, length:] = 0
+        copied[index, :length] = block.opaque[first : first + length]
+        mask[index, :length] = True
+    columns = _columns(records)
+    columns["step"][:] = np.arange(max_steps)
     for name in ("episode_id", "block"):
         columns[name][:] = columns[name][:, :1]
     return EpisodeBatch(image=image, mask=mask, **columns)
 
 
-def _split(records: Records) -> dict[str, Any]:
-    """Return the columns of records as arguments of a batch."""
+def _columns(records: Records) -> dict[str, Any]:
+    """Return the columns of gathered records as arguments of a batch."""
     columns = {name: np.ascontiguousarray(records[name]) for name in batch_columns()}
     more = {name: column for name, column in columns.items() if name not in NAMED}
     return {name: column for name, column in columns.items() if name in NAMED} | {"more": more}
+
+
+def _room(shape: tuple[int, ...]) -> UInt8:
+    """Return an array to be filled, from Arrow's allocator.
+
+    The C library returns the memory of a batch to the system when it is freed, and the next batch pays for pages anew:
+    that took longer than copying the images. Arrow's keeps it (`datasets/__init__.py` says for how long).
+    """
+    return np.frombuffer(pa.allocate_buffer(math.prod(shape)), np.uint8).reshape(shape)

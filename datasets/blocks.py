@@ -1,25 +1,28 @@
 """Reads one block, a row group of a steps table, into numpy without copying its images.
 
-Page checksums are verified on every read. Dimension key: N rows of the block, H W C image.
+Page checksums are verified on every read. Dimension key: N rows of the block, E episodes, H W C image.
 """
 
+import contextlib
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
-from graspq.datasets.batch import Bool, Int64, Records
 from graspq.datasets.columns import RecordType
-from graspq.datasets.episode import UInt8
+from graspq.datasets.episode import Int64, UInt8
 from graspq.datasets.labels import mc_return
+from graspq.datasets.tables import to_numpy
 
 REMEDY = "`grasp-data verify` lists all faults; the command that made the dataset makes bad shards again"
+Records = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -77,10 +80,31 @@ class BlockArrays:
         """Memory that it holds."""
         return self.images.nbytes + self.records.nbytes
 
+    def with_discount(self, discount: float) -> "BlockArrays":
+        """Return the block with `mc_return` made anew from its rewards, with another discount γ in [0, 1]."""
+        records = self.records.copy()
+        for first, length in zip(self.first_rows.tolist(), self.lengths.tolist(), strict=True):
+            episode = slice(first, first + length)
+            records["mc_return"][episode] = mc_return(records["reward"][episode], discount)
+        return replace(self, records=records)
+
 
 def opaque(records: Records) -> Records:
     """Return a view of records as plain bytes, each a `void` of their size."""
     return records.view(np.dtype((np.void, records.dtype.itemsize)))
+
+
+@contextlib.contextmanager
+def readable(what: object) -> Iterator[None]:
+    """Turn whatever goes wrong in reading a Parquet file into one line on `what`.
+
+    Raises:
+        UserError: the file is missing, truncated or damaged.
+    """
+    try:
+        yield
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        raise UserError(f"{what} cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
 
 
 def read_block(
@@ -97,13 +121,20 @@ def read_block(
     Raises:
         UserError: the file is missing, truncated or damaged; the message names the file and the block.
     """
-    try:
-        with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
-            table = file.read_row_group(ref.row_group, use_threads=False)
-        return _block_arrays(ref, table, image_shape, dtype)
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
+    names = (dtype.names or ())[:-1]
+    columns = read_columns(ref, (*names, "image"), metadata)
+    with readable(f"{ref.path}: block {ref.block}"):
+        records = np.zeros(len(columns["image"]), dtype)
+        for name in names:
+            records[name] = columns[name]
+        records["block"] = ref.block
+        terminal = records["terminal"]
+        first_rows = np.flatnonzero(np.concatenate([[True], terminal[:-1]])).astype(np.int64)
+        if len(records) != ref.rows or len(first_rows) != ref.episodes or not terminal[-1]:
+            raise ValueError(f"expected {ref.rows} rows of {ref.episodes} whole episodes")
+        images = columns["image"].reshape(-1, *image_shape)
+    lengths = np.diff(np.append(first_rows, len(records)))
+    return BlockArrays(ref.block, images, records, first_rows, lengths)
 
 
 def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> dict[str, Any]:
@@ -117,13 +148,10 @@ def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> d
     Raises:
         UserError: the file is missing, truncated or damaged; the message names the file and the block.
     """
-    try:
+    with readable(f"{ref.path}: block {ref.block}"):
         with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
             table = file.read_row_group(ref.row_group, columns=list(names), use_threads=False)
-        return {name: _numpy(table.column(name)) for name in names}
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"{ref.path}: block {ref.block} cannot be read ({reason}); {REMEDY}") from None
+        return {name: to_numpy(table.column(name)) for name in names}
 
 
 def read_episode_rows(path: Path) -> list[dict[str, Any]]:
@@ -132,53 +160,7 @@ def read_episode_rows(path: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: the file is missing or damaged.
     """
-    try:
+    with readable(f"{path}:"):
         table = pq.read_table(path, page_checksum_verification=True, use_threads=False, partitioning=None)
         rows: list[dict[str, Any]] = table.to_pylist()
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
     return rows
-
-
-def relabelled(block: BlockArrays, discount: float) -> BlockArrays:
-    """Return the block with `mc_return` made anew from its rewards, with another discount γ in [0, 1]."""
-    records = block.records.copy()
-    for first, length in zip(block.first_rows.tolist(), block.lengths.tolist(), strict=True):
-        episode = slice(first, first + length)
-        records["mc_return"][episode] = mc_return(records["reward"][episode], discount)
-    return replace(block, records=records)
-
-
-def _block_arrays(ref: BlockRef, table: pa.Table, image_shape: tuple[int, int, int], dtype: RecordType) -> BlockArrays:
-    records = np.zeros(table.num_rows, dtype)
-    for name in (dtype.names or ())[:-1]:
-        records[name] = _numpy(table.column(name))
-    records["block"] = ref.block
-    terminal: Bool = records["terminal"]
-    first_rows = np.flatnonzero(np.concatenate([[True], terminal[:-1]])).astype(np.int64)
-    if table.num_rows != ref.rows or len(first_rows) != ref.episodes or not terminal[-1]:
-        raise ValueError(f"expected {ref.rows} rows of {ref.episodes} whole episodes")
-    return BlockArrays(
-        block=ref.block,
-        images=_numpy(table.column("image")).reshape(-1, *image_shape),
-        records=records,
-        first_rows=first_rows,
-        lengths=np.diff(np.append(first_rows, table.num_rows)),
-    )
-
-
-def _numpy(column: pa.ChunkedArray) -> Any:
-    """Return a column as numpy: [N], or [N, ...] for arrays and images; a view wherever Arrow allows one."""
-    return _array(column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks))
-
-
-def _array(array: pa.Array) -> Any:
-    if pa.types.is_fixed_size_binary(array.type):
-        width = array.type.byte_width
-        flat = np.frombuffer(array.buffers()[1], np.uint8, len(array) * width, array.offset * width)
-        flat.flags.writeable = False
-        return flat.reshape(len(array), width)
-    if pa.types.is_fixed_size_list(array.type):
-        inner = _array(array.flatten())
-        return inner.reshape(len(array), array.type.list_size, *inner.shape[1:])
-    return array.to_numpy(zero_copy_only=False)

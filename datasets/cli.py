@@ -1,6 +1,6 @@
 """`grasp-data`: says what is in datasets, verifies them, draws their episodes.
 
-The work is done in `dataset`, `verify` and `show`.
+The work is done in `manifest`, `verify` and `show`.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ from graspq.common.errors import UserError
 from graspq.common.options import Group, Settings, options_from, setting, with_version
 from graspq.common.text import aligned, bytes_text, counted
 from graspq.datasets.columns import quantities
-from graspq.datasets.dataset import Dataset
 from graspq.datasets.manifest import Manifest
 
 
@@ -54,7 +53,7 @@ def main() -> None:
 @options_from(InfoSettings)
 def info(settings: InfoSettings) -> None:
     """Print what datasets hold, from their manifests."""
-    manifests = [Dataset.open(path).manifest for path in settings.path]
+    manifests = [Manifest.load(path) for path in settings.path]
     described = [_described(path, manifest) for path, manifest in zip(settings.path, manifests, strict=True)]
     click.echo(aligned([[name, *(values[name] for values in described)] for name in described[0]]))
 
@@ -65,7 +64,7 @@ def verify(settings: VerifySettings) -> int:
     """Check every byte and every label of a dataset; exit status 2 and a line for each fault."""
     from graspq.datasets.verify import verify as verify_dataset
 
-    total = Dataset.open(settings.path).manifest.bytes
+    total = Manifest.load(settings.path).bytes
     with tqdm(total=total, unit="B", unit_scale=True, desc="verify", disable=None) as bar:
         report = verify_dataset(settings.path, bar.update, settings.workers)
     for line in report.notes:
@@ -88,11 +87,11 @@ def show(settings: ShowSettings) -> None:
     # Imported late: the other commands must not wait for matplotlib.
     from graspq.datasets.show import choose_episodes, save_strips
 
-    dataset = Dataset.open(settings.path)
+    manifest = Manifest.load(settings.path)
     outcome = None if settings.success == settings.failure else settings.success
-    episodes = choose_episodes(dataset, settings.episodes, settings.seed, outcome)
+    episodes = choose_episodes(settings.path, settings.episodes, settings.seed, outcome)
     name = settings.path.resolve().name
-    save_strips(settings.out, episodes, dataset.manifest, f"{dataset.manifest.task_name} grasping · {name}")
+    save_strips(settings.out, episodes, manifest, f"{manifest.task_name} grasping · {name}")
     click.echo(f"{settings.out}: {counted(len(episodes), 'episode')}")
 
 

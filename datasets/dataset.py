@@ -1,18 +1,17 @@
-"""Opens datasets and pools of shards, checking every file against its manifest before anything is read from it."""
+"""Opens datasets as a pool of shards, checking every file against its manifest before anything is read from it."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.datasets.blocks import REMEDY, BlockRef, read_episode_rows
+from graspq.datasets.blocks import REMEDY, BlockRef, read_episode_rows, readable
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
 from graspq.datasets.pool import ShardPool
 
@@ -20,38 +19,96 @@ HASHING_THREADS = 4
 
 
 @dataclass(frozen=True)
-class Dataset:
-    """A dataset folder and its manifest."""
+class Shard:
+    """A shard where it lies.
+
+    Attributes:
+        folder: the dataset.
+        manifest: its manifest.
+        entry: what the manifest says of the shard.
+    """
 
     folder: Path
     manifest: Manifest
+    entry: ShardEntry
 
     @classmethod
-    def open(cls, folder: Path | str) -> "Dataset":
-        """Return the dataset in `folder`; its files are checked when they are read.
+    def all_of(cls, folder: Path) -> list["Shard"]:
+        """Return the shards of a dataset.
 
         Raises:
             UserError: the folder is no dataset, or its manifest is damaged.
         """
-        return cls(Path(folder), Manifest.load(Path(folder)))
+        manifest = Manifest.load(folder)
+        return [cls(folder, manifest, entry) for entry in manifest.shards]
 
-    def pool(self, verify: bool = True) -> ShardPool:
-        """Return all its shards; see `open_shards`."""
-        return _pool([(self, entry) for entry in self.manifest.shards], str(self.folder), verify)
+    @property
+    def steps(self) -> Path:
+        """Its steps table."""
+        return self.folder / steps_file(self.entry.name)
 
-    def shard_pool(self, entry: ShardEntry, verify: bool = True) -> ShardPool:
-        """Return one of its shards as a pool; see `open_shards`."""
-        return _pool([(self, entry)], str(self.folder), verify)
+    @property
+    def episodes(self) -> Path:
+        """Its episodes table."""
+        return self.folder / episodes_file(self.entry.name)
 
-    def episode_rows(self, entry: ShardEntry, verify: bool = True) -> list[dict[str, Any]]:
-        """Return the rows of a shard's episodes table, columns as in `columns.EPISODES`.
+    def check(self, path: Path, verify: bool = True) -> None:
+        """Check one of its two files against the manifest: its size, and its SHA-256 where `verify` says so.
+
+        Raises:
+            UserError: the file is missing, of another size, or of other content.
+        """
+        name = path.relative_to(self.folder).as_posix()
+        try:
+            size, expected = path.stat().st_size, self.entry.sizes[name]
+        except OSError as error:
+            raise UserError(
+                f"{path}: listed in the manifest but cannot be opened ({error.strerror}); {REMEDY}"
+            ) from None
+        if size != expected:
+            what = "truncated" if size < expected else "too long"
+            raise UserError(f"{path}: {what}, {size} bytes instead of {expected}; {REMEDY}")
+        if verify and sha256_of(path) != self.entry.files[name]:
+            raise UserError(f"{path}: damaged, its SHA-256 is not that of the manifest; {REMEDY}")
+
+    def episode_rows(self, verify: bool = True) -> list[dict[str, Any]]:
+        """Return the rows of its episodes table, columns as in `columns.EPISODES`.
 
         Raises:
             UserError: the file is missing or damaged.
         """
-        path = episodes_file(entry.name)
-        check_file(self.folder, entry, path, verify)
-        return read_episode_rows(self.folder / path)
+        self.check(self.episodes, verify)
+        return read_episode_rows(self.episodes)
+
+    def footer(self) -> Any:
+        """Return the footer of its steps table.
+
+        Raises:
+            UserError: it cannot be read, or its blocks are not those of the manifest.
+        """
+        with readable(f"{self.steps}:"):
+            footer = pq.read_metadata(self.steps)
+        if footer.num_row_groups != self.entry.blocks or footer.num_rows != self.entry.rows:
+            raise UserError(
+                f"{self.steps}: expected {self.entry.blocks} blocks with {self.entry.rows} rows, "
+                f"got {footer.num_row_groups} with {footer.num_rows}; {REMEDY}"
+            )
+        return footer
+
+    def blocks(self, footer: Any) -> list[BlockRef]:
+        """Return where its blocks are."""
+        size = self.manifest.block_size
+        return [
+            BlockRef(
+                path=self.steps,
+                row_group=index,
+                block=block,
+                rows=footer.row_group(index).num_rows,
+                episodes=min(size, self.entry.episodes - index * size),
+                key=f"{self.manifest.task_name}/{self.manifest.seed}/{block}",
+            )
+            for index, block in enumerate(self.entry.block_range)
+        ]
 
 
 def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPool:
@@ -66,32 +123,14 @@ def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPoo
     """
     if not patterns:
         raise UserError("--shards: expected dataset folders, shard files or globs, got none")
-    found: dict[tuple[str, int], tuple[Dataset, ShardEntry]] = {}
-    opened: dict[Path, Dataset] = {}
-    for pattern in patterns:
-        for path in _matches(str(pattern)):
-            for dataset, entry in _entries(path, opened):
-                # By content: a copy of a shard under another name is the same shard.
-                found.setdefault((entry.files[steps_file(entry.name)], entry.first_block), (dataset, entry))
-    return _pool(list(found.values()), " ".join(map(str, patterns)), verify)
-
-
-def check_file(folder: Path, entry: ShardEntry, path: str, verify: bool) -> None:
-    """Check one file of a shard against the manifest: its size, and its SHA-256 where `verify` says so.
-
-    Raises:
-        UserError: the file is missing, of another size, or of other content.
-    """
-    full = folder / path
-    try:
-        size = full.stat().st_size
-    except OSError as error:
-        raise UserError(f"{full}: listed in the manifest but cannot be opened ({error.strerror}); {REMEDY}") from None
-    if size != entry.sizes[path]:
-        what = "truncated" if size < entry.sizes[path] else "too long"
-        raise UserError(f"{full}: {what}, {size} bytes instead of {entry.sizes[path]}; {REMEDY}")
-    if verify and sha256_of(full) != entry.files[path]:
-        raise UserError(f"{full}: damaged, its SHA-256 is not that of the manifest; {REMEDY}")
+    opened: dict[Path, list[Shard]] = {}
+    found = [shard for pattern in patterns for path in _matches(str(pattern)) for shard in _shards(path, opened)]
+    # By content: a copy of a shard under another name is the same shard; the one named first counts.
+    once = {(shard.entry.files[steps_file(shard.entry.name)], shard.entry.first_block): shard for shard in found[::-1]}
+    if not once:
+        named = " ".join(map(str, patterns))
+        raise UserError(f"{named}: the dataset has no finished shard yet; run the command that makes it again")
+    return _pool(list(once.values()), verify)
 
 
 def _matches(pattern: str) -> list[Path]:
@@ -105,7 +144,8 @@ def _matches(pattern: str) -> list[Path]:
     return matches
 
 
-def _entries(path: Path, opened: dict[Path, Dataset]) -> Iterable[tuple[Dataset, ShardEntry]]:
+def _shards(path: Path, opened: dict[Path, list[Shard]]) -> list[Shard]:
+    """Return the shards that a folder or file is; those of a dataset that was opened before are in `opened`."""
     if path.is_file():
         folder = path.absolute().parent.parent
     elif path.absolute().name == "shards" and not (path / MANIFEST_NAME).is_file():
@@ -114,30 +154,29 @@ def _entries(path: Path, opened: dict[Path, Dataset]) -> Iterable[tuple[Dataset,
         folder = path
     key = folder.resolve()
     if key not in opened:
-        opened[key] = Dataset.open(folder)
-    dataset = opened[key]
+        opened[key] = Shard.all_of(folder)
     if path.is_dir():
-        return [(dataset, entry) for entry in dataset.manifest.shards]
+        return opened[key]
     inside = f"{path.absolute().parent.name}/{path.name}"
-    listed = [entry for entry in dataset.manifest.shards if steps_file(entry.name) == inside]
+    listed = [shard for shard in opened[key] if steps_file(shard.entry.name) == inside]
     if not listed:
         raise UserError(f"{path}: not a shard of {folder}: its manifest does not list {inside} as a steps table")
-    return [(dataset, listed[0])]
+    return listed
 
 
-def _pool(found: list[tuple[Dataset, ShardEntry]], named: str, verify: bool) -> ShardPool:
-    if not found:
-        raise UserError(f"{named}: the dataset has no finished shard yet; run the command that makes it again")
-    found = sorted(found, key=lambda pair: (_seed(pair[0]), pair[1].first_block, sorted(pair[1].files.values())))
-    _check_agreement([dataset for dataset, _ in found])
+def _pool(shards: list[Shard], verify: bool) -> ShardPool:
+    shards = sorted(
+        shards, key=lambda each: (each.manifest.seed, each.entry.first_block, sorted(each.entry.files.values()))
+    )
+    _check_agreement(shards)
     with ThreadPoolExecutor(HASHING_THREADS) as executor:
-        list(executor.map(lambda pair: check_file(pair[0].folder, pair[1], steps_file(pair[1].name), verify), found))
-    footers = {dataset.folder / steps_file(entry.name): _footer(dataset, entry) for dataset, entry in found}
-    manifest = found[0][0].manifest
-    whole = len(found) == len(manifest.shards) and len({id(dataset) for dataset, _ in found}) == 1
-    digests = "".join(entry.files[steps_file(entry.name)] for _, entry in found)
+        list(executor.map(lambda shard: shard.check(shard.steps, verify), shards))
+    footers = {shard.steps: shard.footer() for shard in shards}
+    manifest = shards[0].manifest
+    whole = len(shards) == len(manifest.shards) and len({id(shard.manifest) for shard in shards}) == 1
+    digests = "".join(shard.entry.files[steps_file(shard.entry.name)] for shard in shards)
     return ShardPool(
-        blocks=tuple(ref for dataset, entry in found for ref in _refs(dataset, entry, footers)),
+        blocks=tuple(ref for shard in shards for ref in shard.blocks(footers[shard.steps])),
         task=manifest.task,
         image_shape=manifest.image_shape,
         action=manifest.action,
@@ -148,39 +187,9 @@ def _pool(found: list[tuple[Dataset, ShardEntry]], named: str, verify: bool) -> 
     )
 
 
-def _footer(dataset: Dataset, entry: ShardEntry) -> Any:
-    path = dataset.folder / steps_file(entry.name)
-    try:
-        footer = pq.read_metadata(path)
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise UserError(f"{path}: not a readable Parquet file ({_one_line(error)}); {REMEDY}") from None
-    if footer.num_row_groups != entry.blocks or footer.num_rows != entry.rows:
-        raise UserError(
-            f"{path}: expected {entry.blocks} blocks with {entry.rows} rows, "
-            f"got {footer.num_row_groups} with {footer.num_rows}; {REMEDY}"
-        )
-    return footer
-
-
-def _refs(dataset: Dataset, entry: ShardEntry, footers: dict[Path, Any]) -> list[BlockRef]:
-    path = dataset.folder / steps_file(entry.name)
-    size = dataset.manifest.block_size
-    return [
-        BlockRef(
-            path=path,
-            row_group=index,
-            block=block,
-            rows=footers[path].row_group(index).num_rows,
-            episodes=min(size, entry.episodes - index * size),
-            key=f"{dataset.manifest.task_name}/{_seed(dataset)}/{block}",
-        )
-        for index, block in enumerate(entry.block_range)
-    ]
-
-
-def _check_agreement(datasets: list[Dataset]) -> None:
-    first = datasets[0]
-    for other in datasets[1:]:
+def _check_agreement(shards: list[Shard]) -> None:
+    first, *others = {shard.folder: shard for shard in shards}.values()
+    for other in others:
         theirs = _agreed(other.manifest)
         for what, ours in _agreed(first.manifest).items():
             if ours != theirs[what]:
@@ -212,11 +221,3 @@ def _shown(value: Any, other: Any) -> str:
             f"{name} = {value.get(name)}" for name in {**value, **other} if value.get(name) != other.get(name)
         )
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-
-def _seed(dataset: Dataset) -> str:
-    return str(dataset.manifest.settings.get("seed", ""))
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -14,6 +14,7 @@ End = Literal["height", "T"]
 ENDS: tuple[str, ...] = get_args(End)
 Float32 = npt.NDArray[np.float32]
 UInt8 = npt.NDArray[np.uint8]
+Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
-"""Endless batches from a pool of shards that may be larger than memory, in the sampler's order.
+"""Batches from blocks that may be more than fits in memory: endless in the sampler's order, or once in their own.
 
 Blocks are read once per window, and the next window is read bit by bit while one is used; a background thread assembles
-the batches ahead. Dimension key: B batch, T steps, H W C image.
+the batches ahead.
 """
 
 import contextlib
@@ -10,83 +10,109 @@ import os
 import queue
 import threading
 import weakref
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
 import numpy as np
 
-from graspq.datasets.batch import EpisodeBatch, Int64, TransitionBatch
-from graspq.datasets.buffer import BlockBuffer
-from graspq.datasets.gather import Blocks, gather_episodes, gather_transitions, located
-from graspq.datasets.pool import ShardPool
+from graspq.datasets.blocks import BlockArrays, BlockRef
+from graspq.datasets.episode import Int64
 from graspq.datasets.sampler import Sampler
 
 B = TypeVar("B")
-# Blocks in memory, the block of each item, its number within it → the batch.
-Gather = Callable[[Blocks, list[int], list[int]], B]
+Read = Callable[[BlockRef], BlockArrays]
+# Blocks in memory by number, the block of each item, its number within it → the batch.
+Gather = Callable[[dict[int, BlockArrays], list[int], list[int]], B]
 DEFAULT_BUFFER_BYTES = 4 * 2**30
+READERS = min(4, os.cpu_count() or 1)
 
 
-class _Source(Generic[B]):
-    """Makes the batches: keeps the blocks of the sampler's window in memory and gathers from them."""
+class BlockBuffer:
+    """The blocks in memory, by their index, and those that threads are reading: asked for ahead, received, forgotten.
 
-    def __init__(self, pool: ShardPool, sampler: Sampler, gather: Gather[B]) -> None:
-        self._sampler, self._gather = sampler, gather
-        self.buffer = BlockBuffer(pool)
+    Args:
+        read: reads a block; called from several threads.
+        refs: all blocks.
+    """
 
-    def batches(self, start_step: int, every: int) -> Iterator[B]:
-        """Yield the batch of every `every`-th global step from `start_step` on, without end."""
-        resident: tuple[int, range] | None = None
-        for global_step in itertools.count(start_step, every):
-            epoch, step = self._sampler.position(global_step)
-            touched = self._sampler.windows_of(epoch, step)
-            following = self._following(epoch, touched.stop)
-            if resident != (epoch, touched):
-                windows = self._sampler.windows(epoch)
-                needed = np.concatenate([windows[window] for window in touched])
-                self.buffer.receive()
-                self.buffer.keep({*needed.tolist(), *following.tolist()})
-                self.buffer.read(needed)
-                resident = epoch, touched
-            yield self._gather(
-                self.buffer.blocks, *located(self._sampler.item_offsets, self._sampler.indices(epoch, step))
-            )
-            if len(touched) == 1 and self._sampler.windows_per_epoch > 1:
-                self._read_ahead(epoch, step, touched.start, following)
+    def __init__(self, read: Read, refs: Sequence[BlockRef]) -> None:
+        self._read, self._refs = read, refs
+        self._readers = ThreadPoolExecutor(READERS, "graspq-reader")
+        self._asked: dict[int, Future[BlockArrays]] = {}
+        self.blocks: dict[int, BlockArrays] = {}
+        self.bytes = self.peak_bytes = 0
 
-    def _following(self, epoch: int, window: int) -> Int64:
-        """Return the blocks of a window, which may be the first of the next epoch."""
-        windows = self._sampler.windows(epoch)
-        return windows[window] if window < len(windows) else self._sampler.windows(epoch + 1)[0]
+    def missing(self, wanted: Iterable[int]) -> list[int]:
+        """Return which blocks are neither here nor asked for."""
+        return [index for index in wanted if index not in self.blocks and index not in self._asked]
 
-    def _read_ahead(self, epoch: int, step: int, window: int, following: Int64) -> None:
-        """Ask for so much of the next window that it is there in time, spread evenly over the steps that are left.
+    def ask(self, indices: Iterable[int]) -> None:
+        """Let the readers begin with some blocks."""
+        for index in indices:
+            self._asked[index] = self._readers.submit(self._read, self._refs[index])
 
-        Readers may be one batch behind: neither they nor the gathering wait for the other at every batch.
+    def receive(self, but: int = 0) -> None:
+        """Wait for the blocks that were asked for, but for the last few.
+
+        Raises:
+            UserError: one is damaged.
         """
-        missing = self.buffer.missing(following)
-        items_left = int(self._sampler.window_borders(epoch)[window + 1]) - (step + 1) * self._sampler.batch_size
-        steps_left = max(1, items_left // self._sampler.batch_size)
-        now = -(-len(missing) // steps_left)
-        self.buffer.receive(but=now)
-        self.buffer.ask(missing[:now])
+        for index in list(self._asked)[: max(0, len(self._asked) - but)]:
+            block = self._asked[index].result()
+            self.blocks[index] = block
+            del self._asked[index]
+            self.bytes += block.bytes
+            self.peak_bytes = max(self.peak_bytes, self.bytes)
+
+    def hold(self, needed: Sequence[int], wanted: Sequence[int] = ()) -> None:
+        """Forget all blocks but those needed and wanted, and wait until all that are needed are here."""
+        self.receive()
+        for index in self.blocks.keys() - {*needed, *wanted}:
+            self.bytes -= self.blocks.pop(index).bytes
+        self.ask(self.missing(needed))
+        self.receive()
+
+    def cancel(self) -> None:
+        """Begin no further block; whoever waits for one gets `CancelledError`."""
+        self._readers.shutdown(wait=False, cancel_futures=True)
+
+    def close(self) -> None:
+        """Stop the readers and forget all blocks."""
+        self._readers.shutdown(cancel_futures=True)
+        self._asked.clear()
+        self.hold(())
 
 
-class _Loader(Generic[B]):
+class Loader(Generic[B]):
     """An endless iterator of batches, assembled ahead by a thread that starts with the first one.
 
-    The thread knows the source and the queue alone: a loader that is dropped without `close` ends its thread.
+    The thread knows the buffer and the queue alone: a loader that is dropped without `close` ends its thread.
+
+    Args:
+        read: reads a block; called from several threads.
+        refs: all blocks, in the order that the sampler numbers them in.
+        sampler: which items each batch has.
+        gather: makes a batch of blocks in memory.
+        start_step: global step of the first batch: an unbroken run and a resumed one give the same batches.
+        every: global steps from one batch to the next: n processes that share the work take every n-th.
+        prefetch: batches assembled ahead by the background thread; 0 works without a thread.
     """
 
     def __init__(
-        self, pool: ShardPool, sampler: Sampler, gather: Gather[B], start_step: int, every: int, prefetch: int
+        self,
+        read: Read,
+        refs: Sequence[BlockRef],
+        sampler: Sampler,
+        gather: Gather[B],
+        start_step: int = 0,
+        every: int = 1,
+        prefetch: int = 2,
     ) -> None:
-        self.pool, self.sampler = pool, sampler
-        self.step, self._every = start_step, every
-        self._source = _Source(pool, sampler, gather)
-        self._batches = self._source.batches(start_step, every)
+        self.sampler, self.step, self._every = sampler, start_step, every
+        self._buffer = BlockBuffer(read, refs)
+        self._batches = _sampled(self._buffer, sampler, gather, itertools.count(start_step, every))
         self._queue: queue.Queue[B | BaseException] = queue.Queue(prefetch)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -98,7 +124,7 @@ class _Loader(Generic[B]):
     @property
     def peak_bytes(self) -> int:
         """Most memory that blocks have taken so far; at most the buffer."""
-        return self._source.buffer.peak_bytes
+        return self._buffer.peak_bytes
 
     def __iter__(self) -> Self:
         return self
@@ -129,10 +155,10 @@ class _Loader(Generic[B]):
         self._stop.set()
         if self._process is None or self._process != os.getpid():
             return
-        self._source.buffer.cancel()
+        self._buffer.cancel()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
-        self._source.buffer.close()
+        self._buffer.close()
 
     def __enter__(self) -> Self:
         return self
@@ -172,89 +198,54 @@ def _fill(batches: Iterator[B], room: "queue.Queue[B | BaseException]", stop: th
         put(error)
 
 
-class TransitionLoader(_Loader[TransitionBatch]):
-    """Endless `TransitionBatch`es of `batch_size` over all ranks; this rank's part of each.
+def _sampled(buffer: BlockBuffer, sampler: Sampler, gather: Gather[B], global_steps: Iterable[int]) -> Iterator[B]:
+    """Yield the batches of some global steps; the blocks of the sampler's window are kept in memory."""
+    resident: tuple[int, range] | None = None
+    for global_step in global_steps:
+        epoch, step = sampler.position(global_step)
+        touched, windows = sampler.windows_of(epoch, step), sampler.windows(epoch)
+        following = (windows[touched.stop] if touched.stop < len(windows) else sampler.windows(epoch + 1)[0]).tolist()
+        if resident != (epoch, touched):
+            buffer.hold(np.concatenate([windows[window] for window in touched]).tolist(), following)
+            resident = epoch, touched
+        yield gather(buffer.blocks, *_located(sampler.item_offsets, sampler.indices(epoch, step)))
+        if len(touched) == 1 and len(windows) > 1:
+            items_left = int(sampler.window_borders(epoch)[touched.stop]) - (step + 1) * sampler.batch_size
+            _read_ahead(buffer, following, max(1, items_left // sampler.batch_size))
+
+
+def _read_ahead(buffer: BlockBuffer, following: list[int], steps_left: int) -> None:
+    """Ask for so much of the next window that it is there in time, spread evenly over the steps that are left.
+
+    Readers may be one batch behind: neither they nor the gathering wait for the other at every batch.
+    """
+    missing = buffer.missing(following)
+    now = -(-len(missing) // steps_left)
+    buffer.receive(but=now)
+    buffer.ask(missing[:now])
+
+
+def in_order(
+    read: Read, refs: Sequence[BlockRef], counts: Sequence[int], batch_size: int, gather: Gather[B]
+) -> Iterator[B]:
+    """Yield all items once, in the order of the blocks; the last batch may be smaller.
 
     Args:
-        pool: the shards.
-        batch_size: samples of a global batch.
-        seed: whole number ≥ 0; the order is a function of it, the epoch and the step.
-        buffer_bytes: bound on the memory that blocks take; a pool that fits is read once.
-        start_step: global step of the first batch: an unbroken run and a resumed one give the same batches.
-        rank: this process, 0 .. ranks − 1.
-        ranks: number of processes.
-        prefetch: batches assembled ahead by the background thread; 0 works without a thread.
-        every: global steps from one batch to the next: n processes that share the work take every n-th.
-        need_next: also gather s′; where no target reads it, leaving it out halves the copying.
-
-    Raises:
-        UserError: the batch is larger than the data, the buffer too small, or (on iterating) a shard is damaged.
+        read: reads a block; called from several threads.
+        refs: all blocks.
+        counts: items of each block.
+        batch_size: items of a batch.
+        gather: makes a batch of blocks in memory.
     """
-
-    def __init__(
-        self,
-        pool: ShardPool,
-        batch_size: int,
-        seed: int,
-        buffer_bytes: int = DEFAULT_BUFFER_BYTES,
-        start_step: int = 0,
-        rank: int = 0,
-        ranks: int = 1,
-        prefetch: int = 2,
-        every: int = 1,
-        need_next: bool = True,
-    ) -> None:
-        rows = buffer_bytes // pool.row_bytes
-        sampler = Sampler([ref.rows for ref in pool.blocks], batch_size, seed, rows, rank, ranks)
-        super().__init__(pool, sampler, partial(gather_transitions, need_next=need_next), start_step, every, prefetch)
-
-
-class EpisodeLoader(_Loader[EpisodeBatch]):
-    """Endless `EpisodeBatch`es of whole episodes padded to `max_steps`; see `TransitionLoader` for the arguments.
-
-    `max_steps` is the task's T where it is not given.
-    """
-
-    def __init__(
-        self,
-        pool: ShardPool,
-        batch_size: int,
-        seed: int,
-        buffer_bytes: int = DEFAULT_BUFFER_BYTES,
-        start_step: int = 0,
-        rank: int = 0,
-        ranks: int = 1,
-        prefetch: int = 2,
-        every: int = 1,
-        max_steps: int | None = None,
-    ) -> None:
-        longest = pool.max_steps if max_steps is None else max_steps
-        rows = buffer_bytes // pool.row_bytes
-        episodes = [ref.episodes for ref in pool.blocks]
-        sampler = Sampler(
-            [ref.rows for ref in pool.blocks], batch_size, seed, rows, rank, ranks, items_per_block=episodes
-        )
-        super().__init__(pool, sampler, partial(gather_episodes, max_steps=longest), start_step, every, prefetch)
-
-
-def transition_batches(pool: ShardPool, batch_size: int, need_next: bool = True) -> Iterator[TransitionBatch]:
-    """Yield every row of the pool once, in its order; the last batch may be smaller. For validation."""
-    counts = [ref.rows for ref in pool.blocks]
-    return _in_order(pool, counts, batch_size, partial(gather_transitions, need_next=need_next))
-
-
-def episode_batches(pool: ShardPool, batch_size: int, max_steps: int | None = None) -> Iterator[EpisodeBatch]:
-    """Yield every episode of the pool once, in its order; the last batch may be smaller. For validation."""
-    longest = pool.max_steps if max_steps is None else max_steps
-    counts = [ref.episodes for ref in pool.blocks]
-    return _in_order(pool, counts, batch_size, partial(gather_episodes, max_steps=longest))
-
-
-def _in_order(pool: ShardPool, counts: list[int], batch_size: int, gather: Gather[B]) -> Iterator[B]:
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    with contextlib.closing(BlockBuffer(pool)) as buffer:
+    with contextlib.closing(BlockBuffer(read, refs)) as buffer:
         for start in range(0, int(offsets[-1]), batch_size):
-            owners, numbers = located(offsets, np.arange(start, min(start + batch_size, int(offsets[-1]))))
-            buffer.keep(set(owners))
-            buffer.read(np.unique(owners))
+            owners, numbers = _located(offsets, np.arange(start, min(start + batch_size, int(offsets[-1]))))
+            buffer.hold(sorted(set(owners)))
             yield gather(buffer.blocks, owners, numbers)
+
+
+def _located(offsets: Int64, items: Int64) -> tuple[list[int], list[int]]:
+    """Return, for each item, its block and its number within that block; `offsets` is the first item of each block."""
+    owners = np.searchsorted(offsets, items, side="right") - 1
+    return owners.tolist(), (items - offsets[owners]).tolist()

@@ -4,7 +4,6 @@ What is not in the manifest does not exist. It carries its own digest, and holds
 """
 
 import dataclasses
-import functools
 import hashlib
 import json
 import re
@@ -132,6 +131,11 @@ class Manifest:
         return int(self.settings["block_size"])
 
     @property
+    def seed(self) -> str:
+        """Seed of the dataset."""
+        return str(self.settings.get("seed", ""))
+
+    @property
     def episodes(self) -> int:
         """Number of episodes in all shards."""
         return sum(entry.episodes for entry in self.shards)
@@ -171,15 +175,12 @@ class Manifest:
 
     def digest(self) -> str:
         """Return the SHA-256 of the manifest's content, 64 hexadecimal digits."""
-        return self._digest
-
-    @functools.cached_property
-    def _digest(self) -> str:
         return _digest_of(self.to_json())
 
     def save(self, folder: Path) -> None:
         """Write `manifest.json` atomically and durably; the same manifest gives the same bytes."""
-        write_json(folder / MANIFEST_NAME, {**self.to_json(), "digest": self.digest()})
+        values = self.to_json()
+        write_json(folder / MANIFEST_NAME, {**values, "digest": _digest_of(values)})
 
     @classmethod
     def load(cls, folder: Path) -> "Manifest":
@@ -198,7 +199,7 @@ class Manifest:
         values = read_json(path, "dataset manifest")
         if not isinstance(values, dict) or "format_version" not in values:
             raise UserError(f"{path}: not a dataset manifest; {REMEDY}")
-        if values["format_version"] != FORMAT_VERSION and values.get("digest") == _digest_without(values):
+        if values["format_version"] != FORMAT_VERSION and values.get("digest") == _digest_of(values):
             raise UserError(
                 f"{path}: format version {values['format_version']}, expected {FORMAT_VERSION}; use another graspq"
             )
@@ -208,7 +209,7 @@ class Manifest:
     def _checked(cls, path: Path, values: dict[str, Any]) -> "Manifest":
         # The bytes are compared, not only the content, so that no flipped bit passes, not even one in white space.
         rendered = json.dumps(values, indent=2, ensure_ascii=False, allow_nan=True) + "\n"
-        if values.get("digest") != _digest_without(values) or path.read_bytes() != rendered.encode():
+        if values.get("digest") != _digest_of(values) or path.read_bytes() != rendered.encode():
             raise UserError(f"{path}: damaged or edited, its content does not match its own digest; {REMEDY}")
         try:
             return cls.from_json({name: value for name, value in values.items() if name != "digest"})
@@ -243,9 +244,6 @@ class Manifest:
         return dataclasses.replace(self, shards=tuple(shards))
 
 
-def _digest_without(values: dict[str, Any]) -> str:
-    return _digest_of({name: value for name, value in values.items() if name != "digest"})
-
-
 def _digest_of(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, ensure_ascii=False, separators=(",", ":")).encode()).hexdigest()
+    content = {name: value for name, value in values.items() if name != "digest"}
+    return hashlib.sha256(json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()).hexdigest()

@@ -11,7 +11,7 @@ import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.common.seeding import generator
-from graspq.datasets.batch import Int64
+from graspq.datasets.episode import Int64
 
 # A window holds at least so many blocks where there are so many: a batch of 256 then spans as many (DESIGN, section 3).
 MINIMUM_WINDOW_BLOCKS = 64

@@ -5,7 +5,6 @@ One row is one episode, one column one step; green rows succeeded.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,21 +15,21 @@ from graspq.common.errors import UserError
 from graspq.common.files import committed
 from graspq.common.seeding import generator
 from graspq.common.text import counted
-from graspq.datasets.dataset import Dataset
+from graspq.datasets.dataset import Shard, open_shards
 from graspq.datasets.episode import Episode
 from graspq.datasets.labels import mc_return
-from graspq.datasets.manifest import Manifest, ShardEntry
+from graspq.datasets.manifest import Manifest
 
 SUCCESS, FAILURE, MUTED, INK = "#1b8a4b", "#a8493f", "#8a8f98", "#22262b"
 ACTION_COLORS = ("#3b6fb6", "#2a9d8f", "#d98324", "#8457a8", "#b0568c", "#6f7f2f", "#4aa3c7", "#8c5a3c")
 CELL, HEADER, TITLE = 1.05, 0.34, 0.72
 
 
-def choose_episodes(dataset: Dataset, count: int, seed: int, success: bool | None = None) -> list[Episode]:
+def choose_episodes(folder: Path, count: int, seed: int, success: bool | None = None) -> list[Episode]:
     """Return episodes drawn at random, in their order.
 
     Args:
-        dataset: where from.
+        folder: the dataset.
         count: how many, fewer where there are fewer.
         seed: the choice is a function of it.
         success: only successful ones, only failed ones, or None for either.
@@ -38,30 +37,27 @@ def choose_episodes(dataset: Dataset, count: int, seed: int, success: bool | Non
     Raises:
         UserError: there is none, or a file is damaged.
     """
-    entries = dataset.manifest.shards
+    shards = Shard.all_of(folder)
     rng = generator("datasets/show", seed)
-    per_shard = -(-count // max(1, len(entries)))
-    chosen: list[tuple[ShardEntry, dict[str, Any]]] = []
-    spare: list[tuple[ShardEntry, dict[str, Any]]] = []
-    for index in rng.permutation(len(entries)):
-        entry = entries[index]
-        rows = [row for row in dataset.episode_rows(entry) if success is None or row["success"] == success]
-        order = [(entry, rows[number]) for number in rng.permutation(len(rows))]
-        wanted = min(per_shard, count - len(chosen))
-        chosen, spare = chosen + order[:wanted], spare + order[wanted:count]
+    per_shard = -(-count // max(1, len(shards)))
+    chosen: list[tuple[int, Path, int]] = []
+    spare: list[tuple[int, Path, int]] = []
+    for shard in (shards[index] for index in rng.permutation(len(shards))):
+        fitting = [
+            (row["episode_id"], shard.steps, number)
+            for number, row in enumerate(shard.episode_rows())
+            if success in (None, row["success"])
+        ]
+        order = [fitting[place] for place in rng.permutation(len(fitting))]
+        taken = min(per_shard, count - len(chosen))
+        chosen, spare = chosen + order[:taken], spare + order[taken:count]
         if len(chosen) == count:
             break
     chosen += spare[: count - len(chosen)]
     if not chosen:
         kind = {None: "", True: "successful ", False: "failed "}[success]
-        raise UserError(f"{dataset.folder}: there is no {kind}episode to show")
-    return [_read(dataset, entry, row) for entry, row in sorted(chosen, key=lambda pair: int(pair[1]["episode_id"]))]
-
-
-def _read(dataset: Dataset, entry: ShardEntry, row: dict[str, Any]) -> Episode:
-    pool = dataset.shard_pool(entry)
-    ref = pool.blocks[row["block"] - entry.first_block]
-    return pool.episode(ref, row["episode_id"] - ref.block * dataset.manifest.block_size)
+        raise UserError(f"{folder}: there is no {kind}episode to show")
+    return [open_shards([path])[number] for _, path, number in sorted(chosen)]
 
 
 def save_strips(path: Path, episodes: Sequence[Episode], manifest: Manifest, title: str) -> None:

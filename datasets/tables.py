@@ -1,4 +1,4 @@
-"""Episodes to Arrow tables, and the Parquet settings of both: a row per step, a row per episode.
+"""Episodes to Arrow tables and back to numpy, and the Parquet settings: a row per step, a row per episode.
 
 The image column is raw RGB: with zstd that is smaller than PNG and decodes ten times as fast (DESIGN, section 3).
 """
@@ -85,6 +85,23 @@ def _schema(manifest: Manifest, table: str, described: Sequence[Column]) -> pa.S
         **{f"graspq.{name}": json.dumps(value) for name, value in facts.items()},
     }
     return pa.schema(fields, metadata=metadata)
+
+
+def to_numpy(column: pa.ChunkedArray) -> Any:
+    """Return a column as numpy: [N], or [N, ...] for arrays and images; a view wherever Arrow allows one."""
+    return _numpy(column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks))
+
+
+def _numpy(array: pa.Array) -> Any:
+    if pa.types.is_fixed_size_binary(array.type):
+        width = array.type.byte_width
+        flat = np.frombuffer(array.buffers()[1], np.uint8, len(array) * width, array.offset * width)
+        flat.flags.writeable = False
+        return flat.reshape(len(array), width)
+    if pa.types.is_fixed_size_list(array.type):
+        inner = _numpy(array.flatten())
+        return inner.reshape(len(array), array.type.list_size, *inner.shape[1:])
+    return array.to_numpy(zero_copy_only=False)
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:

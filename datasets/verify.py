@@ -16,8 +16,8 @@ from graspq.common.errors import UserError
 from graspq.common.files import LOCK_NAME, read_json, sha256_of
 from graspq.datasets.blocks import BlockRef, read_block
 from graspq.datasets.columns import record_dtype, wrong_labels
-from graspq.datasets.dataset import Dataset, check_file
-from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
+from graspq.datasets.dataset import Shard
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from graspq.datasets.tables import episodes_schema, steps_schema
 from graspq.engine import EngineSettings, Place, run
 
@@ -55,8 +55,8 @@ class Checking:
     @contextlib.contextmanager
     def open(self, place: Place) -> Iterator[Callable[[ShardEntry], list[str]]]:
         """Open the dataset."""
-        dataset = Dataset.open(self.folder)
-        yield lambda entry: list(_shard(dataset, entry))
+        manifest = Manifest.load(self.folder)
+        yield lambda entry: list(_faults(Shard(self.folder, manifest, entry)))
 
 
 def verify(folder: Path | str, progress: Progress = lambda _: None, workers: int | None = 0) -> Report:
@@ -71,7 +71,7 @@ def verify(folder: Path | str, progress: Progress = lambda _: None, workers: int
         UserError: the folder is no dataset, or its manifest is damaged.
     """
     folder = Path(folder)
-    manifest = Dataset.open(folder).manifest
+    manifest = Manifest.load(folder)
     faults = [*_named_files(folder, manifest), *_object_files(folder, manifest)]
     engine = EngineSettings(workers=workers if len(manifest.shards) > 1 else 0)
     by_shard: dict[str, list[str]] = {}
@@ -132,30 +132,28 @@ def _others(folder: Path, belonging: set[str]) -> list[str]:
     return sorted(name for path in files if (name := path.relative_to(folder).as_posix()) not in belonging)
 
 
-def _shard(dataset: Dataset, entry: ShardEntry) -> Iterator[str]:
+def _faults(shard: Shard) -> Iterator[str]:
     """Yield the faults of one shard; its content is compared only where its bytes are right."""
     intact = True
-    for path in entry.files:
+    for path in (shard.steps, shard.episodes):
         try:
-            check_file(dataset.folder, entry, path, verify=True)
+            shard.check(path)
         except UserError as error:
             intact = False
-            yield error.message.rsplit("; ", 1)[0] + _where(dataset, entry, path)
+            yield error.message.rsplit("; ", 1)[0] + (_where(shard) if path == shard.steps else "")
     if intact:
         try:
-            yield from _content(dataset, entry)
+            yield from _content(shard)
         except (UserError, OSError, pa.ArrowException, KeyError, ValueError) as error:
-            yield f"{dataset.folder / steps_file(entry.name)}: not the tables expected ({error})"
+            yield f"{shard.steps}: not the tables expected ({error})"
 
 
-def _where(dataset: Dataset, entry: ShardEntry, path: str) -> str:
+def _where(shard: Shard) -> str:
     """Say which blocks of a damaged steps table fail their page checksums."""
-    if path != steps_file(entry.name):
-        return ""
     failed = []
     try:
-        with pq.ParquetFile(dataset.folder / path, page_checksum_verification=True) as file:
-            for index, block in enumerate(entry.block_range):
+        with pq.ParquetFile(shard.steps, page_checksum_verification=True) as file:
+            for index, block in enumerate(shard.entry.block_range):
                 try:
                     file.read_row_group(index, use_threads=False)
                 except (OSError, pa.ArrowException):
@@ -165,29 +163,26 @@ def _where(dataset: Dataset, entry: ShardEntry, path: str) -> str:
     return f" (block {', '.join(failed)})" if failed else ""
 
 
-def _content(dataset: Dataset, entry: ShardEntry) -> Iterator[str]:
-    manifest, path = dataset.manifest, dataset.folder / steps_file(entry.name)
-    rows = dataset.episode_rows(entry, verify=False)
-    episodes_path = dataset.folder / episodes_file(entry.name)
-    for table, expected in ((path, steps_schema(manifest)), (episodes_path, episodes_schema(manifest))):
-        if not pq.read_schema(table).equals(expected, check_metadata=True):
-            yield f"{table}: its columns or their metadata are not those of the manifest"
+def _content(shard: Shard) -> Iterator[str]:
+    manifest, entry = shard.manifest, shard.entry
+    for path, expected in ((shard.steps, steps_schema(manifest)), (shard.episodes, episodes_schema(manifest))):
+        if not pq.read_schema(path).equals(expected, check_metadata=True):
+            yield f"{path}: its columns or their metadata are not those of the manifest"
             return
+    rows = shard.episode_rows(verify=False)
     blocks = [row["block"] for row in rows]
     counts = (len(rows), sum(row["steps"] for row in rows), sum(row["success"] for row in rows))
     if counts != (entry.episodes, entry.rows, entry.successes) or sorted(set(blocks)) != list(entry.block_range):
-        yield f"{episodes_path}: its episodes, steps, successes or blocks are not those of the manifest"
+        yield f"{shard.episodes}: its episodes, steps, successes or blocks are not those of the manifest"
         return
     if (rows[0]["seed"], rows[-1]["seed"]) != tuple(entry.seeds):
-        yield f"{episodes_path}: its seeds are not those of the manifest"
+        yield f"{shard.episodes}: its seeds are not those of the manifest"
     ids = [row["episode_id"] for row in rows]
     if ids != list(range(ids[0], ids[0] + len(ids))) or blocks != sorted(blocks):
-        yield f"{episodes_path}: its episodes are out of order"
-    footer = pq.read_metadata(path)
-    for index, block in enumerate(entry.block_range):
-        episodes = [row for row in rows if row["block"] == block]
-        ref = BlockRef(path, index, block, footer.row_group(index).num_rows, len(episodes), "")
-        yield from (f"{path}: block {block}: {fault}" for fault in _block(manifest, ref, episodes))
+        yield f"{shard.episodes}: its episodes are out of order"
+    for ref in shard.blocks(shard.footer()):
+        episodes = [row for row in rows if row["block"] == ref.block]
+        yield from (f"{shard.steps}: block {ref.block}: {fault}" for fault in _block(manifest, ref, episodes))
 
 
 def _block(manifest: Manifest, ref: BlockRef, episodes: list[dict[str, Any]]) -> Iterator[str]:

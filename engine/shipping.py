@@ -8,23 +8,26 @@ import io
 import os
 import shutil
 import tarfile
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from graspq.common.files import cache_folder, committed_folder
+from graspq.common.files import TEMPORARY_PREFIX, cache_folder, committed, committed_folder, writable_folder
 
 _KEPT_SECONDS = 14 * 24 * 3600
 
 
-def packed(folder: Path) -> bytes:
-    """Return a folder as a tar archive; the same names and contents give the same bytes.
+def packed(folder: Path, parts: Sequence[Path] | None = None) -> bytes:
+    """Return a folder, or those of some parts of it that are there, as a tar archive.
 
-    Links, and what is no file or folder, are left out.
+    The same names and contents give the same bytes. Links, and what is no file or folder, are left out.
     """
+    roots = [folder] if parts is None else parts
+    inside = {path for root in roots for path in (root, *root.rglob("*")) if path != folder}
     content = io.BytesIO()
     with tarfile.open(fileobj=content, mode="w", format=tarfile.PAX_FORMAT) as archive:
-        for path in sorted(folder.rglob("*")):
+        for path in sorted(inside):
             if path.is_symlink() or not (path.is_file() or path.is_dir()):
                 continue
             entry = tarfile.TarInfo(str(path.relative_to(folder)))
@@ -48,6 +51,17 @@ def unpack(content: bytes, folder: Path) -> None:
     """Write the files of a packed folder into `folder`."""
     with tarfile.open(fileobj=io.BytesIO(content)) as archive:
         archive.extractall(folder, filter="data")
+
+
+def unpack_parts(content: bytes, folder: Path, parts: Iterable[Path]) -> None:
+    """Put parts of a packed folder where they belong in `folder`; each takes the place of an older one as a whole."""
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=writable_folder(folder, "parts")) as temporary:
+        unpack(content, Path(temporary))
+        for part in parts:
+            found = Path(temporary) / part.relative_to(folder)
+            if found.exists():
+                with committed_folder(part, replace=True) if found.is_dir() else committed(part) as place:
+                    found.replace(place)
 
 
 def received(digest: str, fetch: Callable[[], bytes]) -> Path:

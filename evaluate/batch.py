@@ -1,13 +1,10 @@
-"""Batches of jobs: the plan as a table, one job after the other, and one table of results.
-
-A job that fails leaves the others alone; what is finished already is not run again.
-"""
+"""Evaluations as a plan: a unit for each job, a table of what will be done, and one table of results."""
 
 import sys
 import time
-import traceback
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ from tqdm import tqdm
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
 from graspq.common.text import aligned, write_csv, write_jsonl
+from graspq.engine.plan import Ending, carry_out
 from graspq.evaluate.evaluation import Prepared, prepare, run_prepared
 from graspq.evaluate.jobs import Job
 from graspq.evaluate.records import EpisodeRow, Evaluation
@@ -31,61 +29,65 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Planned:
-    """A job of a plan.
+    """A job of a plan; a `Unit`.
 
     Attributes:
         job: the job.
+        settings: of the command.
+        place: of the job in the plan, such as `[1/3] `.
         prepared: what it needs; None where that is not there.
-        evaluation: the finished evaluation, if it is there.
-        error: why it cannot be run, or why it failed.
+        missing: what is not there, in one line.
     """
 
     job: Job
+    settings: EvalSettings
+    place: str
     prepared: Prepared | None = None
-    evaluation: Evaluation | None = None
-    error: str | None = None
+    missing: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The folder of its files."""
+        return self.prepared.folder.as_posix() if self.prepared is not None else self.job.label
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """The finished evaluation, if it is there."""
+        return self.prepared.finished if self.prepared is not None else None
+
+    def done(self) -> bool:
+        """Return whether the evaluation is there."""
+        return self.evaluation is not None
+
+    def run(self) -> None:
+        """Play the episodes and write the files.
+
+        Raises:
+            UserError: see `run_prepared`, or what it needs is not there.
+        """
+        if self.prepared is None:
+            raise UserError(self.missing or "")
+        started, episodes, ended = time.monotonic(), self.job.episodes, Counter[bool]()
+        name = f"{self.place}{self.job.label}"
+        with tqdm(total=episodes, desc=name, unit="grasp", file=sys.stderr, disable=None, dynamic_ncols=True) as bar:
+
+            def count(row: EpisodeRow) -> None:
+                ended[row.success] += 1
+                low, high = wilson_interval(ended[True], ended.total())
+                rate = ended[True] / ended.total()
+                bar.set_postfix_str(f"success {100 * rate:.1f} % ± {50 * (high - low):.1f}", refresh=False)
+                bar.update()
+
+            run_prepared(self.prepared, self.settings, count)
+        seconds = time.monotonic() - started
+        click.echo(f"{episodes} episodes in {seconds:.0f} s, {episodes / seconds:.1f} a second", err=True)
 
     @property
     def status(self) -> str:
-        """Return what will be done about it, in a word or a line."""
+        """What will be done about it, in a word or a line."""
         if self.prepared is None:
-            return f"cannot run: {self.error}"
-        return "finished" if self.evaluation is not None else "to do"
-
-    @property
-    def line(self) -> str:
-        """Return its result in one line."""
-        if self.evaluation is None:
-            return f"{self.job.label}: failed: {self.error}"
-        summary = self.evaluation.summary
-        low, high = summary["ci95"]
-        return (
-            f"{self.job.label}: {100 * summary['success_rate']:.1f} % of {summary['episodes']} grasps succeeded "
-            f"(95 %: {100 * low:.1f} to {100 * high:.1f}), {summary['task']} {summary['split']}, "
-            f"{self.evaluation.folder.as_posix()}"
-        )
-
-    def row(self) -> dict[str, Any]:
-        """Return its row of the table of results."""
-        row: dict[str, Any] = dict.fromkeys(COLUMNS)
-        row |= {
-            "label": self.job.label,
-            "policy": self.job.policy,
-            "run": self.job.run.as_posix() if self.job.run is not None else None,
-            "task": self.job.task,
-            "split": self.job.split,
-            "seed": self.job.seed,
-            "episodes": self.job.episodes,
-            "status": "failed" if self.evaluation is None else "finished",
-            "error": self.error,
-        }
-        if self.evaluation is not None:
-            summary = self.evaluation.summary
-            row |= {name: summary[name] for name in COLUMNS if name in summary and name != "object_set"}
-            row["ci95_low"], row["ci95_high"] = summary["ci95"]
-            row["object_set"], row["object_set_sha256"] = summary["object_set"]["name"], summary["object_set"]["sha256"]
-            row["folder"] = self.evaluation.folder.as_posix()
-        return row
+            return f"cannot run: {self.missing}"
+        return "finished" if self.done() else "to do"
 
 
 def make_plan(jobs: Sequence[Job], settings: EvalSettings) -> list[Planned]:
@@ -94,17 +96,17 @@ def make_plan(jobs: Sequence[Job], settings: EvalSettings) -> list[Planned]:
     Raises:
         UserError: the only job cannot be run.
     """
-    plan: dict[Job, Planned] = {}
-    for job in sorted(jobs, key=lambda job: job.run is None):
+    plan: dict[int, Planned] = {}
+    for number, job in sorted(enumerate(jobs), key=lambda numbered: numbered[1].run is None):
+        place = f"[{number + 1}/{len(jobs)}] " if len(jobs) > 1 else ""
         beside = [other.prepared for other in plan.values() if other.prepared is not None]
         try:
-            prepared = prepare(job, settings, beside)
-            plan[job] = Planned(job, prepared, prepared.finished)
+            plan[number] = Planned(job, settings, place, prepare(job, settings, beside))
         except UserError as error:
             if len(jobs) == 1:
                 raise
-            plan[job] = Planned(job, error=error.message)
-    return [plan[job] for job in jobs]
+            plan[number] = Planned(job, settings, place, missing=error.message)
+    return [plan[number] for number in range(len(jobs))]
 
 
 def plan_table(plan: Sequence[Planned]) -> str:
@@ -118,8 +120,8 @@ def plan_table(plan: Sequence[Planned]) -> str:
     return aligned(rows)
 
 
-def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None) -> list[Planned]:
-    """Run what is to do, in order, and return the plan with its results.
+def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None) -> bool:
+    """Run what is to do, in order; return whether every job is finished.
 
     Args:
         plan: the jobs.
@@ -127,71 +129,52 @@ def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None
         table: folder of `results.jsonl` and `results.csv`, rewritten after every job; None for none.
 
     Raises:
-        UserError: the only job fails.
+        UserError: the only job fails, or the table cannot be written.
     """
-    results: list[Planned] = []
-    for number, planned in enumerate(plan, start=1):
-        if planned.prepared is None or (planned.evaluation is not None and not settings.again):
-            results.append(planned)
-        else:
-            place = f"[{number}/{len(plan)}] " if len(plan) > 1 else ""
-            results.append(_run(planned, planned.prepared, settings, place, alone=len(plan) == 1))
-        click.echo(results[-1].line, err=results[-1].evaluation is None)
+    endings: list[Ending[Planned]] = []
+
+    def report(ending: Ending[Planned]) -> None:
+        endings.append(ending)
+        click.echo(_line(ending), err=ending.error is not None)
         if table is not None:
-            write_table(table, results)
-    return results
+            writable_folder(table, "results table")
+            rows = [_row(one) for one in endings]
+            write_jsonl(table / "results.jsonl", rows)
+            write_csv(table / "results.csv", COLUMNS, rows)
+
+    carry_out(plan, report, again=settings.again, keep_going=len(plan) > 1)
+    return all(ending.error is None for ending in endings)
 
 
-def _run(planned: Planned, prepared: Prepared, settings: EvalSettings, place: str, *, alone: bool) -> Planned:
-    started = time.monotonic()
-    episodes = prepared.job.episodes
-    try:
-        with Progress(f"{place}{prepared.job.label}", episodes) as progress:
-            evaluation = run_prepared(prepared, settings, progress.add)
-    except UserError as error:
-        if alone:
-            raise
-        return replace(planned, evaluation=None, error=error.message)
-    except Exception as error:  # a defect: the others go on, and its traceback is shown
-        if alone:
-            raise
-        traceback.print_exc()
-        return replace(planned, evaluation=None, error=f"{type(error).__name__}: {error}")
-    seconds = time.monotonic() - started
-    click.echo(f"{episodes} episodes in {seconds:.0f} s, {episodes / seconds:.1f} a second", err=True)
-    return replace(planned, evaluation=evaluation)
+def _evaluation(ending: Ending[Planned]) -> Evaluation | None:
+    return ending.unit.evaluation if ending.error is None else None
 
 
-def write_table(folder: Path, results: Sequence[Planned]) -> None:
-    """Write `results.jsonl` and `results.csv`, a row for each job, atomically.
+def _line(ending: Ending[Planned]) -> str:
+    """Return what became of a job, for the terminal."""
+    evaluation, label = _evaluation(ending), ending.unit.job.label
+    if evaluation is None:
+        return f"{label}: failed: {ending.error}"
+    summary = evaluation.summary
+    low, high = summary["ci95"]
+    return (
+        f"{label}: {100 * summary['success_rate']:.1f} % of {summary['episodes']} grasps succeeded "
+        f"(95 %: {100 * low:.1f} to {100 * high:.1f}), {summary['task']} {summary['split']}, "
+        f"{evaluation.folder.as_posix()}"
+    )
 
-    Raises:
-        UserError: the folder cannot be written.
-    """
-    writable_folder(folder, "results table")
-    rows = [result.row() for result in results]
-    write_jsonl(folder / "results.jsonl", rows)
-    write_csv(folder / "results.csv", COLUMNS, rows)
 
-
-class Progress:
-    """A progress bar of one job: episodes, success so far with its interval, time left."""
-
-    def __init__(self, name: str, episodes: int) -> None:
-        self._bar = tqdm(total=episodes, desc=name, unit="grasp", file=sys.stderr, disable=None, dynamic_ncols=True)
-        self._successes = self._episodes = 0
-
-    def add(self, row: EpisodeRow) -> None:
-        """Count an episode that has ended."""
-        self._episodes += 1
-        self._successes += row.success
-        low, high = wilson_interval(self._successes, self._episodes)
-        rate = self._successes / self._episodes
-        self._bar.set_postfix_str(f"success {100 * rate:.1f} % ± {50 * (high - low):.1f}", refresh=False)
-        self._bar.update()
-
-    def __enter__(self) -> "Progress":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._bar.close()
+def _row(ending: Ending[Planned]) -> dict[str, Any]:
+    """Return a job's row of the table of results."""
+    job, evaluation = ending.unit.job, _evaluation(ending)
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {name: getattr(job, name) for name in ("label", "policy", "task", "split", "seed", "episodes")}
+    row["run"], row["error"] = job.run.as_posix() if job.run is not None else None, ending.error
+    row["status"] = "failed" if evaluation is None else "finished"
+    if evaluation is not None:
+        summary = evaluation.summary
+        row |= {name: summary[name] for name in COLUMNS if name in summary and name != "object_set"}
+        row["ci95_low"], row["ci95_high"] = summary["ci95"]
+        row["object_set"], row["object_set_sha256"] = summary["object_set"]["name"], summary["object_set"]["sha256"]
+        row["folder"] = evaluation.folder.as_posix()
+    return row

@@ -1,6 +1,6 @@
 """`grasp-eval`: score runs, the random policy, the oracle and users' policies on scenes that no training has seen.
 
-The way on: `jobs` (what to do) -> `batch` (one after the other) -> `evaluation` -> `rollout`, played by `sim/play`.
+The way on: `jobs` (what to do) -> `batch` (the plan) -> `evaluation` -> `rollout`, played by `sim/play`.
 """
 
 from pathlib import Path
@@ -64,12 +64,12 @@ def evaluate(settings: EvalSettings) -> int:
     if settings.plan:
         return int(any(planned.prepared is None for planned in plan))
     table = settings.out if settings.out is not None else _results_folder(settings) if several else None
-    results = run_plan(plan, settings, table)
+    whole = run_plan(plan, settings, table)
     if table is not None:
         click.echo(f"results: {(table / 'results.csv').as_posix()}")
-    if settings.video is not None and results[0].prepared is not None:
-        _write_video(settings, settings.video, results[0].prepared)
-    return int(any(result.evaluation is None for result in results))
+    if settings.video is not None and plan[0].prepared is not None:
+        _write_video(settings, settings.video, plan[0].prepared)
+    return int(not whole)
 
 
 def _results_folder(settings: EvalSettings) -> Path:

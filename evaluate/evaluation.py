@@ -59,7 +59,6 @@ class Prepared:
         run: the same, where it is a run's.
         identity: all that determines the result; the same identity is the same job.
         folder: where its files are or will be.
-        finished: the evaluation, if it is there already.
     """
 
     job: Job
@@ -69,7 +68,11 @@ class Prepared:
     run: "RunPolicy | None"
     identity: dict[str, Any]
     folder: Path
-    finished: Evaluation | None
+
+    @property
+    def finished(self) -> Evaluation | None:
+        """The evaluation, if it is there and whole."""
+        return _evaluation_in(self.folder)
 
     @property
     def task(self) -> Task:
@@ -112,9 +115,10 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
         "policy": job.policy,
         **policy.identity(),
     }
-    folder, finished = _place(job, task.settings.name, settings.out, identity)
+    taken = [other.folder for other in beside if other.identity != identity]
+    folder = _place(job, task.settings.name, settings.out, identity, taken)
     scenes = Scenes(task, objects.folder, job.split, job.seed)
-    return Prepared(job, scenes, objects, policy, run, identity, folder, finished)
+    return Prepared(job, scenes, objects, policy, run, identity, folder)
 
 
 def _check_simulator() -> None:
@@ -165,8 +169,8 @@ def _check_fit(job: Job, run: "RunPolicy", task: Task) -> None:
             )
 
 
-def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any]) -> tuple[Path, Evaluation | None]:
-    """Return the job's folder, and its evaluation if it is finished; another job's evaluation is never overwritten."""
+def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any], taken: Sequence[Path]) -> Path:
+    """Return the job's folder; another job's evaluation, there or still to do, is never overwritten."""
     name = f"{task}-{job.split}-seed{job.seed}-{job.episodes}".replace(":", ".")
     if out is not None or job.run is None:
         parent, name = out if out is not None else BASELINES, f"{job.label.replace(':', '.')}-{name}"
@@ -174,10 +178,8 @@ def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any]) -> t
         parent = job.run / "evaluations"
     first = parent / name
     found = _evaluation_in(first)
-    if found is None or found.summary["job"] == identity:
-        return first, found
-    second = parent / f"{name}-{identity_digest(identity)[:8]}"
-    return second, _evaluation_in(second)
+    free = first not in taken if found is None else found.summary["job"] == identity
+    return first if free else parent / f"{name}-{identity_digest(identity)[:8]}"
 
 
 def _evaluation_in(folder: Path) -> Evaluation | None:

@@ -65,7 +65,7 @@ def jobs_from_settings(settings: EvalSettings) -> list[Job]:
         return read_jobs(settings.jobs, settings)
     if not settings.runs and not settings.policy:
         raise UserError("nothing to evaluate; give run folders, --policy random|oracle|module:factory, or --jobs FILE")
-    return _product({}, settings, runs=settings.runs, policies=settings.policy)
+    return _product({"runs": settings.runs, "policies": settings.policy}, settings)
 
 
 def read_jobs(path: Path, settings: EvalSettings) -> list[Job]:
@@ -92,9 +92,10 @@ def read_jobs(path: Path, settings: EvalSettings) -> list[Job]:
         merged = {**content, **table}
         where = f"{path}, job table {number}"
         _check_keys(merged, where)
-        jobs += _product(
-            merged, settings, runs=merged.get("runs", ()), policies=merged.get("policies", ()), where=where
-        )
+        try:
+            jobs += _product(merged, settings)
+        except UserError as error:
+            raise UserError(f"{where}: {error.message}") from None
     return list(dict.fromkeys(jobs))
 
 
@@ -115,37 +116,17 @@ def _check_keys(table: dict[str, Any], where: str) -> None:
         raise UserError(f"{where}: neither runs nor policies; name at least one")
 
 
-def _product(
-    table: dict[str, Any], settings: EvalSettings, *, runs: Iterable[str], policies: Iterable[str], where: str = ""
-) -> list[Job]:
+def _product(table: dict[str, Any], settings: EvalSettings) -> list[Job]:
     """Multiply a table's lists out; what it lacks comes from the settings."""
-    players: list[tuple[Path | None, str | None]] = [(run, None) for run in find_runs(runs)]
-    players += [(None, checked_policy(policy)) for policy in policies]
+    players: list[tuple[Path | None, str | None]] = [(run, None) for run in find_runs(table.get("runs", ()))]
+    players += [(None, checked_policy(policy)) for policy in table.get("policies", ())]
+    cem = CemSettings.from_json({**settings.cem.to_json(), **table.get("cem", {})})
+    episodes, step = (table.get(name, getattr(settings, name)) for name in ("episodes", "checkpoint"))
     objects = [Path(folder) for folder in table["objects"]] if "objects" in table else [settings.objects]
-    try:
-        cem = CemSettings.from_json({**settings.cem.to_json(), **table.get("cem", {})})
-    except UserError as error:
-        raise UserError(f"{where}: {error.message}" if where else error.message) from None
-    combinations = itertools.product(
-        table.get("tasks", [settings.task]),
-        table.get("splits", [settings.split]),
-        objects,
-        table.get("seeds", [settings.seed]),
-        players,
-    )
+    tasks, splits, seeds = (table.get(f"{name}s", [getattr(settings, name)]) for name in ("task", "split", "seed"))
     return [
-        Job(
-            run=run,
-            policy=policy,
-            task=task,
-            split=split,
-            seed=seed,
-            episodes=table.get("episodes", settings.episodes),
-            objects=folder,
-            checkpoint=table.get("checkpoint", settings.checkpoint) if run is not None else None,
-            cem=cem,
-        )
-        for task, split, folder, seed, (run, policy) in combinations
+        Job(run, policy, task, split, seed, episodes, folder, step if run is not None else None, cem)
+        for task, split, folder, seed, (run, policy) in itertools.product(tasks, splits, objects, seeds, players)
     ]
 
 

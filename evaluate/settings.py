@@ -6,13 +6,13 @@ from typing import Literal
 
 from graspq.common.options import parse_count, setting
 from graspq.engine import EngineSettings
-from graspq.train.search_settings import Answer, CemSettings, StepMode
+from graspq.train.search_settings import CemOptions, CemSettings, StepMode
 
 Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
-class EvalSettings(EngineSettings):
+class EvalSettings(CemOptions, EngineSettings):
     """Settings of `grasp-eval`; see each field's help."""
 
     runs: tuple[str, ...] = setting((), help="Run folders, or globs of them.", positional=True, metavar="[RUN]...")
@@ -31,12 +31,6 @@ class EvalSettings(EngineSettings):
         None, help="Folder of the object set. Default: the one the run's data were made with, else the task's own."
     )
     checkpoint: int | None = setting(None, help="Training step of the checkpoint. Default: the last.", minimum=0)
-    cem_iterations: int = setting(CemSettings.iterations, help="Iterations of CEM.", minimum=1, maximum=100)
-    cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
-    cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
-    cem_answer: Answer = setting(
-        CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
-    )
     cem_synthetic_step: StepMode = setting(
         CemSettings.synthetic_step,
         help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them.",
@@ -52,10 +46,3 @@ class EvalSettings(EngineSettings):
     jobs: Path | None = setting(None, help="TOML file of many jobs, instead of RUN and the options of one job.")
     again: bool = setting(False, help="Run jobs again that are finished already.")
     plan: bool = setting(False, help="Print the plan and stop.")
-
-    @property
-    def cem(self) -> CemSettings:
-        """Return the settings of CEM."""
-        return CemSettings(
-            self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_answer, self.cem_synthetic_step
-        )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gymnasium.envs.registration import register
 
 if TYPE_CHECKING:
-    from graspq.datasets.grasps import Grasps
+    from graspq.datasets.pool import ShardPool
 
 __version__ = "0.1.0"
 
@@ -19,7 +19,7 @@ register(id="graspq/RegularGrasping-v0", entry_point="graspq.sim.environments:Gr
 register(id="graspq/TargetedGrasping-v0", entry_point="graspq.sim.environments:Grasping", kwargs={"task": "targeted"})
 
 
-def open(*shards: str | Path, verify: bool = True) -> "Grasps":
+def open(*shards: str | Path, verify: bool = True) -> "ShardPool":
     """Open datasets to train on: `graspq.open("data/regular-10k").batches(batch_size=256)`.
 
     Args:
@@ -30,6 +30,5 @@ def open(*shards: str | Path, verify: bool = True) -> "Grasps":
         UserError: something is no dataset or is damaged, or the datasets do not fit together.
     """
     from graspq.datasets.dataset import open_shards
-    from graspq.datasets.grasps import Grasps
 
-    return Grasps(open_shards(shards, verify))
+    return open_shards(shards, verify)

@@ -27,7 +27,6 @@ MAY_IMPORT = {
     "datagen": {"engine", "policies", "sim", "objects", "datasets", "common"},
     "evaluate": {"engine", "policies", "sim", "objects", "train", "datasets", "common"},
     "report": {"evaluate", "train", "datasets", "objects", "common"},
-    "online": {"engine", "policies", "sim", "objects", "datagen", "datasets", "train", "evaluate", "common"},
     "studies": {
         "engine",
         "policies",
@@ -37,7 +36,6 @@ MAY_IMPORT = {
         "datasets",
         "train",
         "evaluate",
-        "online",
         "report",
         "common",
     },

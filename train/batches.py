@@ -11,8 +11,6 @@ from typing import Any
 
 import torch
 
-from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.loader import EpisodeLoader, TransitionLoader, episode_batches, transition_batches
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch, episodes_of_a_batch, to_tensors
 from graspq.train.estimator import TargetValue
@@ -47,7 +45,17 @@ def training_batches(
     """
     resident = settings.resident
     # Of a pool on the device the loader gives the order alone, and reads nothing.
-    with _loader(pool, settings, wanted, start_step, ranks, prefetch=0 if resident else 2) as loader:
+    with pool.batches(
+        batch_rows(pool, settings, wanted),
+        settings.seed,
+        view=wanted.view,
+        buffer_bytes=settings.buffer_bytes,
+        start_step=start_step,
+        rank=ranks.rank,
+        ranks=ranks.count,
+        prefetch=0 if resident else 2,
+        need_next=wanted.needs_next,
+    ) as loader:
         if not resident:
             yield (to_tensors(batch, device) for batch in loader)
             return
@@ -57,17 +65,6 @@ def training_batches(
             yield (held.episodes(index) for index in indices)
         else:
             yield (held.transitions(index, wanted.needs_next) for index in indices)
-
-
-def _loader(
-    pool: ShardPool, settings: TrainSettings, wanted: TargetValue[Any], start_step: int, ranks: Ranks, prefetch: int
-) -> TransitionLoader | EpisodeLoader:
-    rows, seed, memory = batch_rows(pool, settings, wanted), settings.seed, settings.buffer_bytes
-    if wanted.view == "episodes":
-        return EpisodeLoader(pool, rows, seed, memory, start_step, ranks.rank, ranks.count, prefetch)
-    return TransitionLoader(
-        pool, rows, seed, memory, start_step, ranks.rank, ranks.count, prefetch, need_next=wanted.needs_next
-    )
 
 
 def batch_rows(pool: ShardPool, settings: TrainSettings, wanted: TargetValue[Any]) -> int:
@@ -84,10 +81,5 @@ def held_back_batches(
     rows = itertools.accumulate(ref.rows for ref in held_back.blocks)
     kept = sum(1 for total in rows if total <= VALIDATION_ROWS)
     pool = dataclasses.replace(held_back, blocks=held_back.blocks[: max(kept, 1)])
-    size = batch_rows(pool, settings, wanted)
-    batches: Iterator[EpisodeBatch | TransitionBatch]
-    if wanted.view == "episodes":
-        batches = episode_batches(pool, size)
-    else:
-        batches = transition_batches(pool, size, wanted.needs_next)
+    batches = pool.once(batch_rows(pool, settings, wanted), view=wanted.view, need_next=wanted.needs_next)
     yield from (to_tensors(batch, device) for batch in batches)

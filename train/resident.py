@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from graspq.common.errors import UserError
-from graspq.datasets.batch import Int64
 from graspq.datasets.blocks import BlockArrays
-from graspq.datasets.buffer import READERS
+from graspq.datasets.episode import Int64
+from graspq.datasets.loader import READERS
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 
@@ -74,7 +74,7 @@ class ResidentPool:
         return cls(image, columns, tensor(np.cumsum(length) - length), length)
 
     def transitions(self, rows: Int64, need_next: bool) -> Batch:
-        """Return the transitions of rows, int64 [B], as `to_tensors` gives those of a `TransitionLoader`."""
+        """Return the transitions of rows, int64 [B], as `to_tensors` gives those of a `TransitionBatch`."""
         index = torch.from_numpy(rows).to(self.image.device)
         columns = {name: column[index].unsqueeze(1) for name, column in self.columns.items()}
         batch = Batch(image=self.image[index].unsqueeze(1), **columns)
@@ -86,7 +86,7 @@ class ResidentPool:
         return dataclasses.replace(batch, next_image=next_image, next_step=batch.step + onward)
 
     def episodes(self, numbers: Int64) -> Batch:
-        """Return episodes, int64 [B], padded to the longest, as `to_tensors` gives those of an `EpisodeLoader`."""
+        """Return episodes, int64 [B], padded to the longest, as `to_tensors` gives those of an `EpisodeBatch`."""
         device, length = self.image.device, self.length[numbers]
         step = torch.arange(int(length.max()), device=device).expand(len(numbers), -1)
         mask = step < torch.from_numpy(length).to(device).unsqueeze(1)

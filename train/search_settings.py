@@ -34,3 +34,30 @@ class CemSettings(Settings):
         super().__post_init__()
         if self.elites > self.samples:
             raise UserError(f"CEM elites: expected at most as many as samples ({self.samples}), got {self.elites}")
+
+
+@dataclasses.dataclass(frozen=True)
+class CemOptions(Settings):
+    """The search as options of a command."""
+
+    cem_iterations: int = setting(CemSettings.iterations, help="Iterations of CEM.", minimum=1, maximum=100)
+    cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
+    cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
+    cem_answer: Answer = setting(
+        CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
+    )
+
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UserError: a value is unknown or out of range.
+        """
+        super().__post_init__()
+        _ = self.cem  # refuses more elites than samples
+
+    @property
+    def cem(self) -> CemSettings:
+        """The search by which a Q-function acts."""
+        names = [field.name for field in dataclasses.fields(CemSettings) if hasattr(self, f"cem_{field.name}")]
+        return CemSettings(**{name: getattr(self, f"cem_{name}") for name in names})

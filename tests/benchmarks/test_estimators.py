@@ -16,16 +16,15 @@ def test_real_transitions_are_counted_and_padding_is_not(tmp_path, monkeypatch):
     make_dataset(tmp_path / "drawn", blocks=50, per_shard=25, size=16)
     monkeypatch.setattr(estimators, "ESTIMATORS", {name: ESTIMATORS[name] for name in MEASURED})
 
-    def a_second_each(runs, turns):
-        for train in runs.values():
-            train()
-        return {name: [1.0] * turns for name in runs}
+    def a_second_each(train, count):
+        train()
+        return lambda turn: 1 / count
 
-    monkeypatch.setattr(estimators, "take_turns", a_second_each)
-    given = {"shards": (str(tmp_path / "drawn"),), "turns": 1, "steps": 2, "threads": 1}
-    result = estimators.measure(estimators.EstimatorsSettings(**given))
+    monkeypatch.setattr(estimators, "timed", a_second_each)
+    settings = estimators.EstimatorsSettings(shards=(str(tmp_path / "drawn"),), turns=1, steps=2)
+    result = estimators.measure(settings)
     pace = {row["estimator"]: row["transitions a second"] for row in result.tables["Training speed of the estimators"]}
-    assert pace["mc"] == pace["dql"] == 2 * 256
+    assert pace["mc"] == pace["dql"] == pytest.approx(2 * 256)
     # Whole episodes of 1 to 8 steps: about as many transitions, of nearly twice as many places.
     assert pace["corr-mc"] == pytest.approx(2 * 256, rel=0.1)
     assert [ratio.value for ratio in result.ratios] == [1.0, pytest.approx(1.0, rel=0.1)]

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from graspq.benchmarks.evaluation_speed import check_rivals, one_at_a_time, together
+from graspq.benchmarks.evaluation_speed import at_once, check_rivals, one_at_a_time, together
 from graspq.benchmarks.rivals import ONCE, TILED, WAYS, asking
 from graspq.common.errors import UserError
 from graspq.evaluate.rollout import Rollouts
@@ -57,6 +57,7 @@ def test_a_rival_travels_to_workers_and_leaves_the_policy_as_it_was(searching):
 def test_rivals_share_the_episodes_of_an_evaluation(searching, regular_objects):
     rollouts = Rollouts(Scenes(TASK, regular_objects.folder, "test", 0), searching)
     alone, successes = one_at_a_time(rollouts, range(2))
-    seconds, shared = together(Rollouts(rollouts.scenes, asking(searching, ONCE)), 2, 2)
-    assert successes == shared and set(shared) == {0, 1}
-    assert np.isfinite([alone, seconds]).all() and min(alone, seconds) > 0
+    seconds, shared = together(Rollouts(rollouts.scenes, asking(searching, ONCE)), 2)
+    ours, played = at_once(rollouts, 2)
+    assert successes == shared == played and set(shared) == {0, 1}
+    assert np.isfinite([alone, seconds, ours]).all() and min(alone, seconds, ours) > 0

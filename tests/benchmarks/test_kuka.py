@@ -2,13 +2,12 @@
 
 import sys
 
-from graspq.benchmarks.kuka import MAX_STEPS, Tally, kuka_grasps
-from graspq.benchmarks.measuring import Call, apart
+from graspq.benchmarks.harness import alone
+from graspq.benchmarks.kuka import MAX_STEPS, kuka_grasps
 
 
 def test_the_wheels_environment_runs_and_obeys_the_protocol() -> None:
-    tally: Tally
-    (tally,) = apart([Call(kuka_grasps, (0, 1))])
+    tally = alone(kuka_grasps, 0, 1)
     assert tally.grasps == 1 and tally.seconds > 0
     # From 0.5 m down to 0.1 m by at most 0.06 m an action, and never more than T.
     assert 5 <= tally.actions <= MAX_STEPS

@@ -19,9 +19,9 @@ def test_time_is_booked_once_and_by_the_phase_that_a_call_was_made_in() -> None:
     module.native = lambda: busy(0.02)
     module.close = lambda: (module.native(), busy(0.01))
     module.step = lambda: (busy(0.01), module.native(), module.close())
-    watch.as_phase(module, "step", "moving")
-    watch.as_phase(module, "close", "grasping")
-    watch.as_part(module, "native", "physics")
+    watch.wrap(module, "step", phase="moving")
+    watch.wrap(module, "close", phase="grasping")
+    watch.wrap(module, "native", what="physics")
     start = time.thread_time()
     with watch:
         module.step()
@@ -43,7 +43,7 @@ def test_functions_are_as_before_also_when_one_raised() -> None:
         raise KeyError("no")
 
     module, watch = types.SimpleNamespace(fail=fail), Stopwatch("rest")
-    watch.as_phase(module, "fail", "failing")
+    watch.wrap(module, "fail", phase="failing")
     with pytest.raises(KeyError), watch:
         module.fail()
     assert module.fail is fail

@@ -24,9 +24,8 @@ def shards_of_64_pixels(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture(scope="module", params=["mc", "dql"])
 def ours(request, shards_of_64_pixels):
     """A session whose weights are as after training: statistics that are not those of the start."""
-    settings = training.TrainingSettings(shards=(shards_of_64_pixels,), threads=1)
-    pool = open_shards(settings.shards)
-    with training_of(request.param, pool, settings, batch_size=8) as current:
+    pool = open_shards([shards_of_64_pixels])
+    with training_of(request.param, [shards_of_64_pixels], pool, batch_size=8) as current:
         for network in (*current.state.networks.online.values(), *current.state.networks.lagged.values()):
             for name, tensor in network.state_dict().items():
                 if name.endswith(("running_mean", "step_to_state.weight")):

@@ -10,8 +10,7 @@ from graspq.datasets import columns
 from graspq.datasets.batch import Samples
 from graspq.datasets.cli import main
 from graspq.datasets.columns import EPISODES, STEPS, EpisodeColumn, StepColumn, quantities
-from graspq.datasets.dataset import Dataset, open_shards
-from graspq.datasets.loader import EpisodeLoader, TransitionLoader
+from graspq.datasets.dataset import Shard, open_shards
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.verify import verify
 from graspq.datasets.writer import commit_shard, write_shard
@@ -29,15 +28,15 @@ def test_a_column_added_to_the_table_is_in_shards_card_batches_and_checks(drawn,
     dropped = EpisodeColumn("dropped", "bool", (), "whether it fell", value=lambda episode: not episode.success)
     monkeypatch.setattr(columns, "STEPS", (*STEPS, to_go, corners))
     monkeypatch.setattr(columns, "EPISODES", (*EPISODES, dropped))
-    manifest = drawn.dataset(tmp_path, blocks=3)
+    drawn.dataset(tmp_path, blocks=3)
     assert verify(tmp_path).faults == ()
     card = (tmp_path / "README.md").read_text()
     assert "| `to_go` | float32 | height above the final pose, metres |" in card and "  - name: to_go" in card
-    assert [row["dropped"] for row in Dataset.open(tmp_path).episode_rows(manifest.shards[0])] == [
+    assert [row["dropped"] for row in Shard.all_of(tmp_path)[0].episode_rows()] == [
         not episode.success for episode in drawn.episodes(0, 3)
     ]
     pool = open_shards([tmp_path])
-    with TransitionLoader(pool, 8, 0) as transitions, EpisodeLoader(pool, 4, 0) as episodes:
+    with pool.batches(8, 0) as transitions, pool.batches(4, 0, view="episodes") as episodes:
         batch, whole = next(transitions), next(episodes)
     for row in range(8):
         episode = drawn.episode(batch.episode_id[row])
@@ -66,7 +65,7 @@ def test_a_dataset_of_five_part_actions_is_written_read_and_checked(drawn, tmp_p
     assert b"phi_range" not in schema.field("gripper_pose").metadata
     pool = open_shards([tmp_path])
     assert pool.action == drawn.five_parts
-    with TransitionLoader(pool, 16, 0) as loader:
+    with pool.batches(16, 0) as loader:
         batch = next(loader)
     assert batch.action.shape == batch.synthetic_action.shape == batch.gripper_pose.shape == (16, 5)
     episode = drawn.episode(batch.episode_id[0], parts=5)

@@ -6,7 +6,7 @@ import pytest
 
 from graspq.common.action_space import grasping
 from graspq.common.errors import UserError
-from graspq.datasets.dataset import Dataset, open_shards
+from graspq.datasets.dataset import open_shards
 from graspq.datasets.labels import mc_return
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.writer import commit_shard, write_shard
@@ -31,7 +31,7 @@ def test_a_short_last_block_has_its_own_number_of_episodes(drawn, tmp_path):
     manifest = drawn.manifest(block_size=3)
     episodes = [drawn.episode(index, 3) for index in range(7)]
     commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 3, episodes))
-    pool = Dataset.open(tmp_path).pool()
+    pool = open_shards([tmp_path])
     assert [ref.episodes for ref in pool.blocks] == [3, 3, 1]
     assert len(pool.read_block(pool.blocks[2]).lengths) == 1
 

@@ -9,7 +9,6 @@ import pytest
 from graspq.common.errors import UserError
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.loader import EpisodeLoader, TransitionLoader, episode_batches, transition_batches
 
 SHAPE = (8, 8, 3)
 
@@ -36,7 +35,7 @@ def same(one, two):
 
 
 def test_every_transition_is_the_one_that_was_collected(pool, drawn):
-    with TransitionLoader(pool, 64, 0) as loader:
+    with pool.batches(64, 0) as loader:
         batch = next(loader)
     assert isinstance(batch, TransitionBatch)
     episodes = {index: drawn.episode(index, 4) for index in np.unique(batch.episode_id)}
@@ -56,7 +55,7 @@ def test_every_transition_is_the_one_that_was_collected(pool, drawn):
 
 
 def test_batches_have_the_stated_types(pool):
-    with TransitionLoader(pool, 16, 0) as loader:
+    with pool.batches(16, 0) as loader:
         batch = next(loader)
     kinds = {name: str(array.dtype) for name, array in batch.arrays().items()}
     assert {kinds[name] for name in ("image", "next_image")} == {"uint8"}
@@ -69,7 +68,7 @@ def test_batches_have_the_stated_types(pool):
 
 
 def test_an_epoch_covers_the_data_once(pool):
-    loader = TransitionLoader(pool, 100, 0)
+    loader = pool.batches(100, 0)
     batches = take(loader, loader.sampler.steps_per_epoch)
     keys = {key for batch in batches for key in zip(batch.episode_id.tolist(), batch.step.tolist(), strict=True)}
     assert len(keys) == 100 * len(batches)
@@ -78,14 +77,14 @@ def test_an_epoch_covers_the_data_once(pool):
 
 @pytest.mark.parametrize("start", [1, 60])
 def test_a_resumed_run_gives_the_batches_of_an_unbroken_one(pool, small_buffer, start):
-    unbroken = take(TransitionLoader(pool, 100, 9, small_buffer), 70)
-    resumed = take(TransitionLoader(pool, 100, 9, small_buffer, start_step=start), 70 - start)
+    unbroken = take(pool.batches(100, 9, buffer_bytes=small_buffer), 70)
+    resumed = take(pool.batches(100, 9, buffer_bytes=small_buffer, start_step=start), 70 - start)
     for one, two in zip(unbroken[start:], resumed, strict=True):
         same(one, two)
 
 
 def test_the_background_thread_changes_nothing(pool, small_buffer):
-    batches = [take(TransitionLoader(pool, 100, 2, small_buffer, prefetch=prefetch), 40) for prefetch in (0, 1, 4)]
+    batches = [take(pool.batches(100, 2, buffer_bytes=small_buffer, prefetch=prefetch), 40) for prefetch in (0, 1, 4)]
     for one, two, three in zip(*batches, strict=True):
         same(one, two)
         same(one, three)
@@ -94,15 +93,15 @@ def test_the_background_thread_changes_nothing(pool, small_buffer):
 @pytest.mark.parametrize("ranks", [1, 2, 3, 4])
 def test_ranks_together_see_the_global_batches(dataset, ranks):
     pool = open_shards([dataset])
-    whole = take(TransitionLoader(pool, 22, 1), 5)
-    parts = [take(TransitionLoader(pool, 22, 1, rank=rank, ranks=ranks), 5) for rank in range(ranks)]
+    whole = take(pool.batches(22, 1), 5)
+    parts = [take(pool.batches(22, 1, rank=rank, ranks=ranks), 5) for rank in range(ranks)]
     for step, batch in enumerate(whole):
         joined = np.concatenate([part[step].image for part in parts])
         assert np.array_equal(joined, batch.image)
 
 
 def test_data_larger_than_the_buffer_stream_within_it(pool, small_buffer):
-    loader = TransitionLoader(pool, 100, 0, small_buffer)
+    loader = pool.batches(100, 0, buffer_bytes=small_buffer)
     assert loader.sampler.windows_per_epoch > 1
     steps = 2 * loader.sampler.steps_per_epoch + 3
     with loader:
@@ -115,17 +114,17 @@ def test_data_that_fit_are_read_once(pool, monkeypatch):
     reads = []
     read = type(pool).read_block
     monkeypatch.setattr(type(pool), "read_block", lambda self, ref: reads.append(ref.block) or read(self, ref))
-    loader = TransitionLoader(pool, 100, 0, prefetch=0)
+    loader = pool.batches(100, 0, prefetch=0)
     take(loader, 3 * loader.sampler.steps_per_epoch)
     assert sorted(reads) == list(range(200))
 
 
 def test_reading_ahead_leaves_no_window_to_be_read_at_its_border(pool, small_buffer, monkeypatch):
-    loader = TransitionLoader(pool, 100, 0, small_buffer, prefetch=0)
-    next(loader)
     reads = []
     read = type(pool).read_block
     monkeypatch.setattr(type(pool), "read_block", lambda self, ref: reads.append(ref.block) or read(self, ref))
+    loader = pool.batches(100, 0, buffer_bytes=small_buffer, prefetch=0)
+    next(loader)
     most = 0
     for _ in range(2 * loader.sampler.steps_per_epoch):
         reads.clear()
@@ -135,12 +134,12 @@ def test_reading_ahead_leaves_no_window_to_be_read_at_its_border(pool, small_buf
 
 
 def test_without_next_there_is_no_next_image(pool):
-    with TransitionLoader(pool, 16, 0, need_next=False) as loader:
+    with pool.batches(16, 0, need_next=False) as loader:
         assert next(loader).next_image is None
 
 
 def test_episodes_are_padded_and_masked(pool, drawn):
-    with EpisodeLoader(pool, 16, 0) as loader:
+    with pool.batches(16, 0, view="episodes") as loader:
         for _ in range(20):  # memory is used again: padding must be written
             batch = next(loader)
     assert isinstance(batch, EpisodeBatch)
@@ -158,23 +157,23 @@ def test_episodes_are_padded_and_masked(pool, drawn):
 
 
 def test_an_epoch_of_episodes_covers_them_once_and_resumes(pool):
-    loader = EpisodeLoader(pool, 50, 4)
+    loader = pool.batches(50, 4, view="episodes")
     batches = take(loader, loader.sampler.steps_per_epoch)
     assert np.array_equal(np.sort(np.concatenate([batch.episode_id[:, 0] for batch in batches])), np.arange(800))
-    same(take(EpisodeLoader(pool, 50, 4, start_step=7), 1)[0], batches[7])
+    same(take(pool.batches(50, 4, start_step=7, view="episodes"), 1)[0], batches[7])
 
 
 def test_an_episode_longer_than_the_padding_is_refused(pool):
-    with pytest.raises(ValueError, match="max_steps"), EpisodeLoader(pool, 50, 4, max_steps=3) as loader:
+    with pytest.raises(ValueError, match="max_steps"), pool.batches(50, 4, max_steps=3, view="episodes") as loader:
         next(loader)
 
 
 def test_in_order_every_row_and_episode_comes_once(pool):
-    rows = list(transition_batches(pool, 300))
+    rows = list(pool.once(300))
     assert sum(len(batch) for batch in rows) == pool.rows
     ids = np.concatenate([batch.episode_id for batch in rows])
     assert np.array_equal(ids, np.sort(ids))
-    assert sum(int(batch.mask.sum()) for batch in episode_batches(pool, 64)) == pool.rows
+    assert sum(int(batch.mask.sum()) for batch in pool.once(64, view="episodes")) == pool.rows
 
 
 def test_a_shard_damaged_while_training_stops_the_loader_with_one_line(new_dataset):
@@ -185,11 +184,11 @@ def test_a_shard_damaged_while_training_stops_the_loader_with_one_line(new_datas
     content[400] ^= 1
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"blocks-000000-000003\.parquet: block \d cannot be read.*grasp-data verify"):
-        take(TransitionLoader(pool, 4, 0), 2)
+        take(pool.batches(4, 0), 2)
 
 
 def test_closing_ends_the_thread_and_the_iteration(pool):
-    loader = TransitionLoader(pool, 100, 0)
+    loader = pool.batches(100, 0)
     next(loader)
     loader.close()
     loader.close()
@@ -202,7 +201,7 @@ def loader_threads():
 
 
 def test_the_thread_starts_with_the_first_batch_and_ends_when_the_loader_is_dropped(pool):
-    loader = TransitionLoader(pool, 100, 0)
+    loader = pool.batches(100, 0)
     assert loader_threads() == []
     next(loader)
     (thread,) = loader_threads()
@@ -235,7 +234,7 @@ def in_a_fork(work):
 @pytest.mark.filterwarnings("ignore:.*use of fork.*:DeprecationWarning")
 @pytest.mark.parametrize("prefetch", [0, 2])
 def test_a_fork_can_begin_a_loader_but_not_go_on_with_one(pool, prefetch):
-    with TransitionLoader(pool, 100, 0, prefetch=prefetch) as loader:
+    with pool.batches(100, 0, prefetch=prefetch) as loader:
         forked = in_a_fork(lambda: next(loader).episode_id)
         assert np.array_equal(forked, next(loader).episode_id)
         told = in_a_fork(lambda: next(loader).episode_id)
@@ -244,7 +243,7 @@ def test_a_fork_can_begin_a_loader_but_not_go_on_with_one(pool, prefetch):
 
 
 def test_the_step_counts_the_batches_given_out(pool):
-    with TransitionLoader(pool, 100, 0, start_step=5) as loader:
+    with pool.batches(100, 0, start_step=5) as loader:
         next(loader)
         next(loader)
         assert loader.step == 7

@@ -12,7 +12,7 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
-from graspq.datasets.dataset import Dataset
+from graspq.datasets.dataset import Shard, open_shards
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.verify import verify
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
@@ -23,9 +23,8 @@ def files_of(folder):
 
 
 def test_what_is_read_is_what_was_written(dataset, drawn):
-    opened = Dataset.open(dataset)
-    pool = opened.pool()
-    rows = [row for entry in opened.manifest.shards for row in opened.episode_rows(entry)]
+    pool = open_shards([dataset])
+    rows = [row for shard in Shard.all_of(dataset) for row in shard.episode_rows()]
     for block, ref in enumerate(pool.blocks):
         arrays = pool.read_block(ref)
         for number in range(2):
@@ -66,7 +65,7 @@ def test_a_shard_exists_only_once_it_is_committed(drawn, tmp_path):
     write_shard(tmp_path, manifest, 0, 2, drawn.episodes(0, 2))
     assert Manifest.load(tmp_path).shards == ()
     with pytest.raises(UserError, match="no finished shard yet"):
-        Dataset.open(tmp_path).pool()
+        open_shards([tmp_path])
 
 
 def test_episodes_that_are_not_those_of_the_blocks_are_refused(drawn, tmp_path):

@@ -4,7 +4,7 @@ import time
 import pytest
 
 from graspq.common.files import cache_folder
-from graspq.engine.shipping import digest_of, packed, received, unpack
+from graspq.engine.shipping import digest_of, packed, received, unpack, unpack_parts
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +34,17 @@ def test_a_folder_comes_out_as_it_went_in_but_for_links(tmp_path):
     unpack(packed(folder), tmp_path / "out")
     found = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*")}
     assert found == {"deep", "deep/a.bin", "b.txt"} and (tmp_path / "out/deep/a.bin").read_bytes() == b"\0\1"
+
+
+def test_parts_of_a_folder_take_the_place_of_older_ones_and_nothing_else_is_touched(tmp_path):
+    here, there = make(tmp_path / "one"), make(tmp_path / "two")
+    (there / "deep/a.bin").unlink()
+    (there / "deep/new").write_text("n")
+    (there / "c.txt").write_text("c")
+    content = packed(there, [there / "deep", there / "c.txt", there / "absent"])
+    unpack_parts(content, here, [here / "deep", here / "c.txt", here / "absent"])
+    found = {str(path.relative_to(here)) for path in here.rglob("*")}
+    assert found == {"deep", "deep/new", "b.txt", "c.txt"}
 
 
 def test_what_has_been_received_is_not_fetched_again_and_goes_when_nobody_uses_it(tmp_path):

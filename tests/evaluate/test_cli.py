@@ -116,6 +116,21 @@ def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_hav
     assert tasks(run_folder) == ["regular", "regular"]
 
 
+def test_jobs_of_one_plan_that_differ_in_the_search_alone_have_folders_of_their_own(
+    workplace: SimpleNamespace, run_folder: Path, tmp_path: Path
+) -> None:
+    from graspq.evaluate.batch import make_plan
+    from graspq.evaluate.jobs import jobs_from_settings
+
+    settings = replace(workplace.settings, policy=(), out=tmp_path / "scores")
+    (job,) = jobs_from_settings(settings)
+    other = replace(job, cem=replace(job.cem, samples=32))
+    plan = make_plan([job, other, job], settings)
+    names = [planned.name for planned in plan]
+    assert len(set(names)) == 2 and names[0] == names[2]
+    assert [planned.done() for planned in plan] == [False] * 3
+
+
 def test_finished_jobs_are_not_run_again_and_nothing_changes(
     workplace: SimpleNamespace, run_folder: Path, command: Any
 ) -> None:

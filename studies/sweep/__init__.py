@@ -1,0 +1,1 @@
+"""Sweeps: a training and its evaluation at every point of a grid."""
