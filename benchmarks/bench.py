@@ -24,6 +24,7 @@ BEGIN, END = "<!-- made by benchmarks/bench.py -->", "<!-- end -->"
 # A script with its options. {shards} and {run} stand for the options of this command, {work} for a folder of the part.
 PARTS = {
     "collection": "collection",
+    "frame": "frame",
     "worker_memory": "worker_memory --scenes 10000",
     "loading": "loading --shards {shards}",
     "streaming": "streaming --shards {shards}",

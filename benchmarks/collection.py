@@ -26,7 +26,7 @@ from graspq.datasets.episode import Episode
 from graspq.engine import EngineSettings
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
-from graspq.sim import camera, cell, episode, kinematics
+from graspq.sim import cell, episode, kinematics, rasteriser
 from graspq.sim.bullet import bullet
 from graspq.sim.task import task_named
 
@@ -94,13 +94,15 @@ def watched(watch: Stopwatch) -> Stopwatch:
         (cell, "settle", "settling"),
         (episode.GraspSimulation, "step", "moving"),
         (episode.GraspSimulation, "_close_and_lift", "grasping and lifting"),
-        (camera.Camera, "render", "rendering"),
+        (episode.GraspSimulation, "render", "rendering"),
         (writer, "write_shard", "writing"),
         (writer, "commit_shard", "writing"),
     ):
         watch.wrap(owner, name, phase=phase)
-    for name in ("stepSimulation", "getCameraImage", "loadURDF", "resetSimulation"):
+    for name in ("stepSimulation", "getLinkStates", "loadURDF", "resetSimulation"):
         watch.wrap(bullet, name, what="PyBullet")
+    for name in ("project", "fill", "colour", "shade"):
+        watch.wrap(rasteriser, name, what="rasteriser")
     watch.wrap(bullet, "setJointMotorControlArray", what="IK and motors")
     watch.wrap(kinematics, "joint_angles", what="IK and motors")
     return watch
@@ -115,7 +117,7 @@ def phases(objects: Path, seed: int, blocks: int) -> list[Row]:
     spent = {place: 1e3 * seconds / grasps for place, seconds in watch.seconds.items()}
     rows = []
     for phase in {phase for phase, _ in spent}:
-        kinds = {kind: spent.get((phase, kind), 0.0) for kind in ("PyBullet", "IK and motors", PYTHON)}
+        kinds = {kind: spent.get((phase, kind), 0.0) for kind in ("PyBullet", "IK and motors", "rasteriser", PYTHON)}
         total = sum(kinds.values())
         share = f"{total / sum(spent.values()):.0%}"
         rows.append({"phase of a grasp": phase, "CPU ms": total, "share": share, **kinds})

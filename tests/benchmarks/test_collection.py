@@ -24,4 +24,4 @@ def test_the_phases_of_a_grasp_make_a_whole_and_the_longest_stands_first(regular
     assert times == sorted(times, reverse=True) and len(rows) == 7
     assert sum(float(row["share"].rstrip("%")) for row in rows) == pytest.approx(100, abs=4)
     rendering = next(row for row in rows if row["phase of a grasp"] == "rendering")
-    assert rendering["PyBullet"] > rendering["Python"] > 0
+    assert rendering["rasteriser"] > rendering["Python"] > 0
