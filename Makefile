@@ -15,21 +15,22 @@ QUICK := runs/quickstart
 QUICK_STEPS := 700
 export PYTHONUNBUFFERED := 1
 
-.PHONY: help setup quickstart test lint types data bench clean
+.PHONY: help setup quickstart test python-versions lint types data bench clean
 
 help: ## this list
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 17
 
 setup: $(STAMP) ## make .venv and install everything into it
 
 $(STAMP): pyproject.toml constraints.txt
 	@set -e; \
 	if [ ! -x $(BIN)/python ]; then \
-	  is311='import sys; sys.exit(sys.version_info[:2] != (3, 11))'; \
-	  if command -v python3 >/dev/null && python3 -c "$$is311"; then python3 -m venv $(VENV); \
-	  elif command -v python3.11 >/dev/null && python3.11 -c "$$is311"; then python3.11 -m venv $(VENV); \
-	  elif command -v uv >/dev/null; then uv venv --seed --python 3.11 $(VENV); \
-	  else echo "Python 3.11 is needed (PyBullet has no wheel for a newer one): install python3.11 with its venv module, or uv" >&2; exit 2; fi; \
+	  fits='import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'; \
+	  for python in python3 python3.11 python3.12 python3.13; do \
+	    if $$python -c "$$fits" >/dev/null 2>&1; then $$python -m venv $(VENV); break; fi; \
+	  done; \
+	  if [ ! -x $(BIN)/python ] && command -v uv >/dev/null; then uv venv --seed --python 3.11 $(VENV); fi; \
+	  if [ ! -x $(BIN)/python ]; then echo "Python 3.11, 3.12 or 3.13 is needed: install one with its venv module, or uv" >&2; exit 2; fi; \
 	fi
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt pip setuptools wheel
 	$(if $(TORCH_INDEX),$(BIN)/python -m pip install -q --disable-pip-version-check --index-url $(TORCH_INDEX) -c constraints.txt torch)
@@ -55,6 +56,9 @@ bench: setup ## every published ratio: results/bench.json and the table in RESUL
 test: setup lint types ## everything that CI checks (at most 10 minutes)
 	$(BIN)/python -P -m pytest -n $(TEST_WORKERS) --dist loadfile
 
+python-versions: setup ## whether newer Pythons at hand collect the same bytes (3.12, 3.13; skips those that are not there)
+	@bash .ci/python_versions.sh
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -67,4 +71,4 @@ types: setup
 	cd .types && ../$(BIN)/mypy --config-file ../pyproject.toml -p graspq
 
 clean: ## remove what can be made again, but for data/ and runs/
-	rm -rf $(VENV) .types build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-3.* .types build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

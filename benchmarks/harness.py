@@ -23,7 +23,7 @@ from graspq.common.provenance import code_revision, versions
 from graspq.common.text import markdown
 from graspq.engine import EngineSettings, Place, run
 
-PACKAGES = ("torch", "pybullet", "numpy", "pyarrow", "datasets", "d3rlpy")
+PACKAGES = ("torch", "pybullet", "pybullet-arm64", "numpy", "pyarrow", "datasets", "d3rlpy")
 TOLERANCE = 1e-4  # of a rival's Q to ours
 COLUMNS = ("in one run", "measured", "bar", "aim", "met")
 Row = dict[str, Any]

@@ -35,7 +35,7 @@ from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.task import Task, task_named
 
-VERSIONS = ("numpy", "scipy", "pybullet", "pyarrow", "trimesh")
+VERSIONS = ("numpy", "scipy", "pybullet", "pybullet-arm64", "pyarrow", "trimesh")
 
 
 def make_dataset(settings: DatagenSettings) -> Manifest:

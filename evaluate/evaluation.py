@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from graspq.policies.of_run import RunPolicy
 
 BASELINES = Path("runs/baselines")
-PACKAGES = ("numpy", "pybullet", "torch")
+PACKAGES = ("numpy", "pybullet", "pybullet-arm64", "torch")
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
         _check_fit(job, run, task)
     task.draw(objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
     identity = {
-        "simulator": versions("pybullet", "numpy"),
+        "simulator": versions("pybullet", "pybullet-arm64", "numpy"),
         "task": task.settings.to_json(),
         "task_source": source_digest(task.settings.name) if ":" in task.settings.name else None,
         "split": job.split,

@@ -1,16 +1,17 @@
 """The Panda under Cartesian position control, its gripper vertical.
 
 Set-points run along straight lines with eased speed, one a simulation step, through the closed-form kinematics; motors
-do the rest.
+do the rest. Where the gripper meets nothing on its way the arm may be put there without being simulated.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from graspq.sim import kinematics, robot_model
 from graspq.sim.bullet import bullet
+from graspq.sim.clearance import Boxes
 from graspq.sim.task import TaskSettings
 from graspq.sim.world import World
 
@@ -40,14 +41,26 @@ class Arm:
                 rollingFriction=0.0,
                 restitution=0.0,
             )
-        self.commanded = np.zeros(4)
+        self.place((*self.home()[:3], 0.0))
+        self.gripper = Boxes([self._bounds(link) for link in (robot_model.HAND_LINK, *self.fingers)])
+        self.between_pads = Boxes([self._between_pads()])
+
+    def _bounds(self, link: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the bounds of a link relative to the tool centre point."""
+        low, high = self.body.bounds(link)
+        return low - self.commanded[:3], high - self.commanded[:3]
+
+    def _between_pads(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the bounds of what the open fingers sweep as they close, themselves included."""
+        lows, highs = zip(*(self._bounds(finger) for finger in self.fingers), strict=True)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def home(self) -> np.ndarray:
         """Return the pose at which an episode starts."""
         return np.array([self.task.bin_center_x, 0.0, self.task.home_height, 0.0])
 
-    def place(self, pose: Sequence[float] | np.ndarray) -> None:
-        """Put the arm at a pose at once, at rest, awake, the gripper open."""
+    def place(self, pose: Sequence[float] | np.ndarray, *, open_gripper: bool = True) -> None:
+        """Put the arm at a pose at once, at rest, awake, the gripper open or closed."""
         self.body.change_dynamics(
             activationState=bullet.ACTIVATION_STATE_WAKE_UP | bullet.ACTIVATION_STATE_DISABLE_SLEEPING
         )
@@ -55,10 +68,11 @@ class Arm:
         self._joints = kinematics.joint_angles(*self.commanded)
         for joint, angle in zip(robot_model.ARM_JOINTS, self._joints, strict=True):
             bullet.resetJointState(self.number, joint, angle, 0.0, physicsClientId=self.client)
+        opening = robot_model.FINGER_OPENING if open_gripper else 0.0
         for finger in self.fingers:
-            bullet.resetJointState(self.number, finger, robot_model.FINGER_OPENING, 0.0, physicsClientId=self.client)
+            bullet.resetJointState(self.number, finger, opening, 0.0, physicsClientId=self.client)
         self._hold(self._joints, (0.0,) * 7)
-        self.grip(open_gripper=True)
+        self.grip(open_gripper=open_gripper)
 
     def park(self) -> None:
         """Put the arm where no falling object can meet it, asleep until `place`: a sleeping arm costs no time."""
@@ -85,13 +99,8 @@ class Arm:
 
     def move(self, pose: Sequence[float] | np.ndarray, steps: int, hold: int = 0) -> None:
         """Move in a straight line to a pose in `steps` simulation steps, then hold it for `hold` more."""
-        # Plain numbers: NumPy's overhead on four of them would be felt at 240 set-points a second.
-        start, goal = self.commanded.tolist(), [float(value) for value in pose]
-        way = [there - here for here, there in zip(start, goal, strict=True)]
-        for index in range(1, steps + 1):
-            # Cosine easing: a jump in speed would jerk objects out of the gripper.
-            eased = 0.5 - 0.5 * math.cos(math.pi * index / steps)
-            joints = kinematics.joint_angles(*[here + part * eased for here, part in zip(start, way, strict=True)])
+        for here in self._way(pose, steps):
+            joints = kinematics.joint_angles(*here)
             speeds = [(now - before) / self.world.time_step for now, before in zip(joints, self._joints, strict=True)]
             self._hold(joints, speeds)
             self._joints = joints
@@ -99,7 +108,26 @@ class Arm:
         if hold > 0:
             self._hold(self._joints, (0.0,) * 7)
             self.world.step(hold)
-        self.commanded = np.array(goal)
+        self.commanded = np.array(pose, dtype=float)
+
+    def carry(self, pose: Sequence[float] | np.ndarray, steps: int, *, open_gripper: bool = True) -> None:
+        """Put the arm at a pose, at rest; whoever watches the world sees the way that `move` would take."""
+        if self.world.is_watched:
+            for here in list(self._way(pose, steps))[:-1]:
+                self.place(here, open_gripper=open_gripper)
+                self.world.show()
+        self.place(pose, open_gripper=open_gripper)
+        self.world.show()
+
+    def _way(self, pose: Sequence[float] | np.ndarray, steps: int) -> Iterator[list[float]]:
+        """Yield `steps` poses along the straight line from the commanded pose to another one, which comes last."""
+        # Plain numbers: NumPy's overhead on four of them would be felt at 240 set-points a second.
+        start, goal = self.commanded.tolist(), [float(value) for value in pose]
+        way = [there - here for here, there in zip(start, goal, strict=True)]
+        for index in range(1, steps + 1):
+            # Cosine easing: a jump in speed would jerk objects out of the gripper.
+            eased = 0.5 - 0.5 * math.cos(math.pi * index / steps)
+            yield [here + part * eased for here, part in zip(start, way, strict=True)]
 
     def _hold(self, joints: Sequence[float], speeds: Sequence[float]) -> None:
         bullet.setJointMotorControlArray(

@@ -23,7 +23,11 @@ _FLOOR_COLOR = (0.80, 0.79, 0.76, 1.0)
 _WALL_COLOR = (0.42, 0.47, 0.53, 1.0)
 _DROP_SPACING = 0.055  # metres of height between one falling object and the next
 _REST_SPEED = 0.012  # metres a second
-_CHECK_EVERY = 20  # simulation steps
+# While objects fall, nothing is gripped: longer steps and fewer iterations do.
+_FALL_TIME_STEP = 1 / 120  # seconds
+_FALL_ITERATIONS = 10
+_CHECK_EVERY = 10  # steps of a fall
+_FALL_AT_LEAST = 50  # steps
 
 
 class Box(NamedTuple):
@@ -52,11 +56,15 @@ def table_box(task: TaskSettings) -> Box:
     return Box(_TABLE, (task.bin_center_x - _TABLE_BEHIND, 0, -0.022), _TABLE_COLOR)
 
 
-def build_bin(world: World, task: TaskSettings) -> None:
-    """Add the table, and the floor of the bin and its walls."""
+def build_bin(world: World, task: TaskSettings) -> list[Body]:
+    """Add the table, and the floor of the bin and its walls, which are returned."""
     world.add_picture(*table_box(task))
-    for box in bin_boxes(task):
-        world.add_box(*box).change_dynamics(lateralFriction=0.8, restitution=0.0)
+    parts = [world.add_box(*box) for box in bin_boxes(task)]
+    for part in parts:
+        part.change_dynamics(lateralFriction=0.8, restitution=0.0)
+        # Beside an immovable body that is awake a sleeping object would cost 4 microseconds a step.
+        part.change_dynamics(activationState=bullet.ACTIVATION_STATE_SLEEP)
+    return parts
 
 
 def load_objects(world: World, task: TaskSettings, objects: ObjectSet, object_ids: Sequence[str]) -> list[Body]:
@@ -87,17 +95,26 @@ def drop(bodies: Sequence[Body], task: TaskSettings, rng: np.random.Generator) -
         body.set_pose((task.bin_center_x + dx, dy, 0.06 + _DROP_SPACING * rank), quaternion)
 
 
-def settle(world: World, bodies: Sequence[Body], task: TaskSettings) -> int:
-    """Simulate until all objects rest, at most `settle_steps`; put them to sleep; return the steps taken."""
-    taken = 0
-    while taken < task.settle_steps:
-        world.step(_CHECK_EVERY)
-        taken += _CHECK_EVERY
-        if taken >= 100 and max(body.speed() for body in bodies) < _REST_SPEED:
-            break
+def settle(world: World, bodies: Sequence[Body], task: TaskSettings) -> float:
+    """Simulate until all objects rest, at most `settle_steps` time steps of the task; put them to sleep.
+
+    Returns the seconds simulated.
+    """
+    taken, most = 0, round(task.settle_steps * task.time_step / _FALL_TIME_STEP)
+    with world.paced(_FALL_TIME_STEP, _FALL_ITERATIONS):
+        while taken < most:
+            world.step(_CHECK_EVERY)
+            taken += _CHECK_EVERY
+            if taken >= _FALL_AT_LEAST and at_rest(bodies):
+                break
     for body in bodies:
         sleep(body)
-    return taken
+    return taken * _FALL_TIME_STEP
+
+
+def at_rest(bodies: Sequence[Body]) -> bool:
+    """Return whether no object moves faster than what counts as rest."""
+    return all(body.speed() < _REST_SPEED for body in bodies)
 
 
 def sleep(body: Body) -> None:

@@ -42,8 +42,7 @@ class World:
             raise RuntimeError("PyBullet could not open its window; is there a display?")
         self.gui = gui
         self._after_step: Callable[[], None] | None = None
-        self.time_step = time_step
-        self.solver_iterations = solver_iterations
+        self._pace = time_step, solver_iterations
         self.reset()
 
     def reset(self) -> None:
@@ -52,23 +51,44 @@ class World:
         bullet.setGravity(0, 0, -9.81, physicsClientId=self.client)
         # Overlapping pairs in a fixed order: without it the solver may meet contacts in another order each run.
         bullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.time_step,
-            numSolverIterations=self.solver_iterations,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=1,
-            physicsClientId=self.client,
+            deterministicOverlappingPairs=1, enableFileCaching=1, physicsClientId=self.client
         )
+        self._set_pace(*self._pace)
+
+    def _set_pace(self, time_step: float, solver_iterations: int) -> None:
+        self.time_step = time_step
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=time_step, numSolverIterations=solver_iterations, physicsClientId=self.client
+        )
+
+    @contextlib.contextmanager
+    def paced(self, time_step: float, solver_iterations: int) -> Iterator[None]:
+        """Simulate with another time step (seconds) and other iterations, until the `with` statement ends."""
+        self._set_pace(time_step, solver_iterations)
+        try:
+            yield
+        finally:
+            self._set_pace(*self._pace)
 
     def step(self, count: int = 1) -> None:
         """Advance by `count` simulation steps."""
         for _ in range(count):
             bullet.stepSimulation(physicsClientId=self.client)
-            if self._after_step is not None:
-                self._after_step()
+            self.show()
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody watches; see `watched`."""
+        return self._after_step is not None
+
+    def show(self) -> None:
+        """Let who watches see the world as it is."""
+        if self._after_step is not None:
+            self._after_step()
 
     @contextlib.contextmanager
     def watched(self, after_step: Callable[[], None]) -> Iterator[None]:
-        """Call `after_step` after every simulation step, until the `with` statement ends."""
+        """Call `after_step` after each simulation step and with each `show`, until the `with` statement ends."""
         self._after_step = after_step
         try:
             yield

@@ -130,3 +130,54 @@ def test_observations_have_depth_and_mask_on_request_alone(simulation, regular_o
         np.testing.assert_array_equal(seen.image, simulation.observation.image)
         for found, expected in zip((seen.depth, seen.mask), simulation.depth_and_mask(64), strict=True):
             np.testing.assert_array_equal(found, expected)
+
+
+def test_where_the_gripper_meets_nothing_it_is_put_where_simulation_would_take_it(simulation, monkeypatch):
+    steps = []
+    step = simulation.world.step
+    monkeypatch.setattr(simulation.world, "step", lambda *args: steps.append(1) or step(*args))
+    actions = [[0.5, -1.0, -0.5, 1.0], [-1.0, 0.3, 0.2, -0.4], [0.1, 0.2, -0.9, 0.7]]
+
+    def poses():
+        simulation.load(simulation.object_ids)
+        simulation.reset(np.random.default_rng(0))
+        steps.clear()
+        rest = simulation.object_poses()
+        found = np.stack([simulation.step(action).observation.gripper_pose for action in actions])
+        np.testing.assert_array_equal(simulation.object_poses(), rest)
+        return found, len(steps)
+
+    put, none = poses()
+    monkeypatch.setattr(simulation, "_is_clear", lambda *args: False)
+    moved, some = poses()
+    assert (none, some > 50) == (0, True)
+    assert (np.abs(put - moved) < [0.002, 0.002, 0.002, 0.01]).all(), np.abs(put - moved).max(axis=0)
+
+
+def test_what_lies_in_the_way_is_met(simulation):
+    simulation.reset(np.random.default_rng(0))
+    before = simulation.object_poses()
+    way = (before[0, :2] - [TASK.settings.bin_center_x, 0.0]) / TASK.settings.translation_limit
+    for part in (np.clip(way, -1, 1), way - np.clip(way, -1, 1)):
+        simulation.step([*part, 0, 0])
+    np.testing.assert_array_equal(simulation.object_poses(), before)
+    while not simulation.terminated:
+        simulation.step([0, 0, -1, 0])
+    assert np.abs(simulation.object_poses() - before).max() > 0.001
+
+
+def test_fingers_that_close_on_nothing_lift_nothing_and_rise_all_the_same(simulation):
+    empty = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        simulation.reset(rng)
+        outcome = simulation.step(RandomPolicy().act(None, rng))
+        while not outcome.terminated:
+            outcome = simulation.step(RandomPolicy().act(None, rng))
+        pose = outcome.observation.gripper_pose
+        assert pose[2] == pytest.approx(simulation.arm.commanded[2], abs=0.004)
+        assert pose[2] > TASK.settings.lift_height
+        if simulation.arm.finger_gap() < 0.001:
+            empty += 1
+            assert outcome.reward == 0.0
+    assert empty >= 2
