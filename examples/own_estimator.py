@@ -12,11 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, Metrics, TargetValue, loss_of, targets_of
 from graspq.train.estimators import dql
 from graspq.train.networks.network import Features, NetworkSpecification, QNetwork
-from graspq.train.selection import StochasticSearch, uniform_actions
+from graspq.train.selection import uniform_actions
 from graspq.train.state import TrainState
 
 

@@ -16,9 +16,9 @@ from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.errors import UserError
 from graspq.sim.observation import Observation
 from graspq.sim.task import task_from_json
+from graspq.train.acting import Acting, ActionSelection, ObservedState, StochasticSearch
 from graspq.train.networks.network import NetworkSpecification
 from graspq.train.search_settings import CemSettings
-from graspq.train.selection import Acting, ActionSelection, StochasticSearch
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -99,7 +99,7 @@ class RunPolicy:
             image = torch.from_numpy(np.ascontiguousarray(observation.image)).to(self._device).unsqueeze(0)
             step = torch.tensor([observation.step], device=self._device)
             pose = torch.from_numpy(np.asarray(observation.gripper_pose)).to(self._device).unsqueeze(0)
-            action, q = self.selection.act(self._placed, image, step, pose, rng, self.cem)
+            action, q = self.selection.act(self._placed, ObservedState(image, step, pose), rng, self.cem)
             self.q = None if q is None else float(q[0])
             answer: np.ndarray = action[0].float().cpu().numpy()
         return answer

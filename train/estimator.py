@@ -15,11 +15,11 @@ from torch.nn import functional
 from graspq.common.options import Settings, setting
 from graspq.common.text import markdown
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import ActionSelection
 from graspq.train.batch import Batch
 from graspq.train.networks import Parts, q_network
 from graspq.train.networks.network import Link
 from graspq.train.recipe import PAPER, Recipe
-from graspq.train.selection import ActionSelection
 from graspq.train.state import Networks, TrainState
 
 Metrics = dict[str, Tensor]

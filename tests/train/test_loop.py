@@ -18,11 +18,12 @@ import torch
 from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
 from graspq.train import loop
+from graspq.train.acting import Acting, ObservedState
 from graspq.train.checkpoint import load_acting
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.loop import DivergedError, train
 from graspq.train.run import Run
-from graspq.train.selection import Acting, CemSettings
+from graspq.train.search_settings import CemSettings
 from graspq.train.settings import TrainSettings
 
 Make = Callable[..., TrainSettings]
@@ -271,6 +272,6 @@ def test_actions_of_five_parts_without_a_mirror_plane_train_every_row_and_act(
     bounds = torch.full((5,), -1.0), torch.full((5,), 1.0)
     acting = Acting(loaded.networks, loaded.kept, loaded.specification.action, bounds)
     image, step = torch.zeros(1, 16, 16, 3, dtype=torch.uint8), torch.zeros(1, dtype=torch.int64)
-    pose, random = torch.zeros(1, 5), np.random.default_rng(0)
-    action, _ = ESTIMATORS[algo].action_selection.act(acting, image, step, pose, random, CemSettings())
+    state, random = ObservedState(image, step, pose=torch.zeros(1, 5)), np.random.default_rng(0)
+    action, _ = ESTIMATORS[algo].action_selection.act(acting, state, random, CemSettings())
     assert action.shape == (1, 5) and float(action.abs().max()) <= 1

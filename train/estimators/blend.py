@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, Metrics, TargetValue, loss_of
 from graspq.train.estimators.corr_mc import CorrectionSettings, Judged, advantages, judged, later_steps
-from graspq.train.selection import StochasticSearch
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import blended, corrected_episode_value
 

@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.augment import mirror_image
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, LaggedSettings, TargetValue
 from graspq.train.recipe import PAPER
-from graspq.train.selection import StochasticSearch, uniform_actions
+from graspq.train.selection import uniform_actions
 from graspq.train.state import Networks
-from graspq.train.targets import corrected_episode_value
+from graspq.train.targets import corrected_episode_value, double_q
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +99,8 @@ def judged(batch: Batch, networks: Networks, settings: CorrectionSettings, rando
         candidates = torch.cat([logged, drawn.to(later.device)[later]], dim=1)
         mirror = networks.specification.action.mirror if settings.look_in_mirror else None
         seen_image, seen = (image, candidates) if mirror is None else mirror_image(image, candidates, mirror)
-        picked = networks.q.at(seen_image, step)(seen).argmax(1, keepdim=True)
-        both = torch.cat([logged, candidates.take_along_dim(picked.unsqueeze(2), 1)], dim=1)
-        q_of_both = networks.lagged_q.at(image, step)(both).float()
+        q_of_seen, judge = networks.q.at(seen_image, step)(seen), networks.lagged_q.at(image, step)
+        q_of_both = double_q(q_of_seen, candidates, judge, beside=logged).float()
         q[later], value[later] = q_of_both[:, 0], q_of_both.amax(1)
     return Judged(value, q)
 

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import ActorNetwork
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, LaggedSettings, Metrics, TargetValue, regression
 from graspq.train.networks import q_network, state_network
-from graspq.train.selection import FARTHEST_POINT, ActorNetwork, QOfActions, pointed
+from graspq.train.selection import FARTHEST_POINT, QOfActions, pointed
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import bootstrapped
 

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, LaggedSettings, TargetValue
-from graspq.train.selection import StochasticSearch, uniform_actions, uniform_search
+from graspq.train.selection import uniform_actions
 from graspq.train.state import Networks
-from graspq.train.targets import bootstrapped
+from graspq.train.targets import bootstrapped, double_q
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +25,7 @@ class DqlSettings(LaggedSettings):
 
 
 def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torch.Generator, progress: float) -> Tensor:
-    """Return r + γ Q_θ'(s', a*), a* the best for Q_θ of N uniform actions; float [B, T]. See `targets.bootstrapped`.
+    """Return r + γ V(s'), V by double Q of N uniform actions; float [B, T]. See `targets.bootstrapped` and `double_q`.
 
     One trunk pass of each network on s', whatever the number of candidates.
 
@@ -34,8 +35,7 @@ def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torc
     """
     image, step = batch.next_states
     drawn = uniform_actions(random, len(image), settings.candidates, batch.action.shape[-1]).to(image.device)
-    best = uniform_search(networks.q.at(image, step), drawn)
-    next_value = networks.lagged_q.at(image, step)(best.action.unsqueeze(1)).squeeze(1)
+    next_value = double_q(networks.q.at(image, step)(drawn), drawn, networks.lagged_q.at(image, step))
     return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), settings.discount)
 
 

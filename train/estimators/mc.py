@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, RegressionSettings, TargetValue
-from graspq.train.selection import StochasticSearch
 from graspq.train.state import Networks
 from graspq.train.targets import episode_value
 

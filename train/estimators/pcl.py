@@ -12,11 +12,12 @@ from torch import Tensor, nn
 from graspq.common.action_space import ActionSpace
 from graspq.common.options import setting
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import ActorNetwork
 from graspq.train.batch import Batch
 from graspq.train.estimator import LOSSES, Estimator, EstimatorSettings, Metrics, TargetValue
 from graspq.train.networks import state_network
 from graspq.train.recipe import PAPER
-from graspq.train.selection import ActorNetwork, pointed
+from graspq.train.selection import pointed
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import path_consistent
 
