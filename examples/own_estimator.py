@@ -36,7 +36,6 @@ class SmallNetwork(QNetwork):
     def __init__(self, specification: NetworkSpecification) -> None:
         super().__init__()
         height, width, channels = specification.image_shape
-        self.link = specification.link
         self.convolutions = nn.Sequential(
             nn.Conv2d(channels, 16, 4, 4), nn.ReLU(), nn.Conv2d(16, 32, 3, 2, 1), nn.ReLU(), nn.Flatten()
         )

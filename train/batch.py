@@ -4,6 +4,7 @@ Dimensions: B batch, T steps, A action, H W C image.
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 import torch
@@ -46,17 +47,30 @@ class Batch:
         """Number of steps that are no padding, a scalar."""
         return torch.tensor(self.step.numel(), device=self.step.device) if self.mask is None else self.mask.sum()
 
+    @functools.cached_property
+    def later_steps(self) -> Tensor:
+        """Which steps are real and not the first of their episode; bool [B, T]."""
+        later = torch.ones_like(self.terminal) if self.mask is None else self.mask.clone()
+        later[:, 0] = False
+        return later
+
     @property
     def next_states(self) -> tuple[Tensor, Tensor]:
         """Images uint8 [B T, H, W, C] and steps int64 [B T] of s'; a ValueError where the loader left them out."""
         if self.next_image is None or self.next_step is None:
-            raise ValueError("a bootstrapped target needs next_image and next_step in the batch")
+            raise ValueError("no s' in this batch: a target that reads it says so by TargetValue(..., needs_next=True)")
         return self.next_image.flatten(0, 1), self.next_step.flatten()
 
     def real(self, values: Tensor) -> Tensor:
         """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""
         flat = values.flatten(0, 1)
         return flat if self.mask is None else flat[self.mask.flatten()]
+
+    def in_place(self, values: Tensor) -> Tensor:
+        """Return values of the real steps, float [n] or [n, 1], where these stand in [B, T]; 0 on padding."""
+        if self.mask is None:
+            return values.view_as(self.reward)
+        return torch.zeros_like(self.reward).masked_scatter(self.mask, values)
 
 
 def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> Batch:

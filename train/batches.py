@@ -23,19 +23,13 @@ VALIDATION_ROWS = 8192
 
 @contextlib.contextmanager
 def training_batches(
-    pool: ShardPool,
-    settings: TrainSettings,
-    wanted: TargetValue[Any],
-    device: torch.device,
-    start_step: int,
-    ranks: Ranks = ALONE,
+    pool: ShardPool, settings: TrainSettings, device: torch.device, start_step: int, ranks: Ranks = ALONE
 ) -> Iterator[Iterator[Batch]]:
     """Give the endless batches of a training, this rank's part of each, from the step `start_step` on.
 
     Args:
         pool: what to train on.
-        settings: of the run.
-        wanted: says whether a batch holds transitions or episodes, and whether it needs s'.
+        settings: of the run; its estimator says whether a batch holds transitions or episodes, and what it reads.
         device: where the batches lie.
         start_step: of the first batch.
         ranks: those that share each batch.
@@ -43,7 +37,7 @@ def training_batches(
     Raises:
         UserError: a batch is larger than the data, the buffer too small, or a shard is damaged.
     """
-    resident = settings.resident
+    pool, wanted, resident = _with_returns(pool, settings), settings.estimator.target_value, settings.resident
     # Of a pool on the device the loader gives the order alone, and reads nothing.
     with pool.batches(
         batch_rows(pool, settings, wanted),
@@ -74,10 +68,16 @@ def batch_rows(pool: ShardPool, settings: TrainSettings, wanted: TargetValue[Any
     return episodes_of_a_batch(pool, settings.batch_size)
 
 
-def held_back_batches(
-    held_back: ShardPool, settings: TrainSettings, wanted: TargetValue[Any], device: torch.device
-) -> Iterator[Batch]:
+def _with_returns(pool: ShardPool, settings: TrainSettings) -> ShardPool:
+    """Return the pool with returns of the run's discount, where the target reads them."""
+    if not settings.estimator.target_value.needs_return:
+        return pool
+    return pool.with_discount(settings.own.chosen_discount(pool.discount))
+
+
+def held_back_batches(held_back: ShardPool, settings: TrainSettings, device: torch.device) -> Iterator[Batch]:
     """Yield the batches of a validation: the first blocks that have at most `VALIDATION_ROWS` rows."""
+    held_back, wanted = _with_returns(held_back, settings), settings.estimator.target_value
     rows = itertools.accumulate(ref.rows for ref in held_back.blocks)
     kept = sum(1 for total in rows if total <= VALIDATION_ROWS)
     pool = dataclasses.replace(held_back, blocks=held_back.blocks[: max(kept, 1)])

@@ -11,14 +11,14 @@ from torch import Tensor
 from graspq.common.options import setting
 from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
-from graspq.train.estimator import Estimator, LaggedSettings, TargetValue
+from graspq.train.estimator import Estimator, LaggedSettings, RegressionSettings, TargetValue
 from graspq.train.selection import uniform_actions
 from graspq.train.state import Networks
 from graspq.train.targets import bootstrapped, double_q
 
 
 @dataclasses.dataclass(frozen=True)
-class DqlSettings(LaggedSettings):
+class DqlSettings(LaggedSettings, RegressionSettings):
     """Options of `dql`."""
 
     candidates: int = setting(16, help="Uniform actions among which a target looks for the best.", minimum=1)
@@ -36,13 +36,15 @@ def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torc
     image, step = batch.next_states
     drawn = uniform_actions(random, len(image), settings.candidates, batch.action.shape[-1]).to(image.device)
     next_value = double_q(networks.q.at(image, step)(drawn), drawn, networks.lagged_q.at(image, step))
-    return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), settings.discount)
+    return bootstrapped(batch.reward, batch.terminal, batch.in_place(next_value), settings.discount)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="Double Q-learning: the reward and the discounted value of the best next action",
     settings=DqlSettings,
-    target_value=TargetValue("bootstrapped (double Q, lagged target network)", target, needs_next=True),
+    target_value=TargetValue(
+        "bootstrapped (double Q, lagged target network)", target, needs_next=True, needs_return=False
+    ),
     action_selection=StochasticSearch(),
     paper=DqlSettings(loss="squared"),
 )

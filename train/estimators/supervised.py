@@ -14,31 +14,20 @@ from graspq.datasets.pool import ShardPool
 from graspq.train.acting import Acting, ObservedState, StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, RegressionSettings, TargetValue
+from graspq.train.estimators import mc
 from graspq.train.search_settings import CemSettings, StepMode
 from graspq.train.selection import SearchSpace
-from graspq.train.state import Networks
-from graspq.train.targets import episode_value
 
 PREFIX = "synthetic_"
 
 
 @dataclasses.dataclass(frozen=True)
 class SupervisedSettings(RegressionSettings):
-    """Options of `supervised`."""
+    """Options of `supervised`; its target is that of `mc`, the return, which without discount is the outcome."""
 
     def chosen_discount(self, stored: float) -> float:
         """Return 1: the outcome has no discount."""
         return 1.0
-
-
-def target(
-    batch: Batch, networks: Networks, settings: SupervisedSettings, random: torch.Generator, progress: float
-) -> Tensor:
-    """Return the outcome, which is the return without discount; float [B, T]. See `targets.episode_value`.
-
-    Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning".
-    """
-    return episode_value(batch.mc_return)
 
 
 def synthetic_action(batch: Batch) -> Tensor:
@@ -138,12 +127,12 @@ class SearchOfMotions(StochasticSearch):
         return one_step_of(found, cem.synthetic_step)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="The outcome of the episode, as if one motion had led from the current pose to the last one",
     settings=SupervisedSettings,
-    target_value=TargetValue("episode value, on synthetic actions", target),
+    target_value=TargetValue("episode value, on synthetic actions", mc.target),
     action_selection=SearchOfMotions(),
     paper=SupervisedSettings(loss="squared"),
-    action=synthetic_action,
+    regressed_action=synthetic_action,
     kept=measured_motions,
 )

@@ -93,7 +93,7 @@ def test_labels_are_outcomes_without_discount_whatever_the_datasets_discount_is(
 def test_the_row_regresses_on_synthetic_actions() -> None:
     row = ESTIMATORS["supervised"]
     batch = SimpleNamespace(action="logged", synthetic_action="synthetic")
-    assert row.action(batch) == "synthetic" and isinstance(row.action_selection, SearchOfMotions)  # type: ignore[arg-type]
+    assert row.regressed_action(batch) == "synthetic" and isinstance(row.action_selection, SearchOfMotions)  # type: ignore[arg-type]
 
 
 def test_a_step_of_a_motion_is_scaled_along_its_line_or_clipped_and_a_short_motion_is_one_step() -> None:
