@@ -56,7 +56,7 @@ class Sampler:
         self.item_offsets: Int64 = np.concatenate([[0], np.cumsum(self._items)]).astype(np.int64)
         total = int(self._items.sum())
         if not 1 <= batch_size <= total:
-            raise UserError(f"--batch-size: expected 1 to {total}, the number of samples in the data, got {batch_size}")
+            raise UserError(f"batch_size: expected 1 to {total}, the number of samples in the data, got {batch_size}")
         if not 0 <= rank < ranks <= batch_size:
             raise UserError(f"rank {rank} of {ranks}: expected 0 <= rank < ranks <= batch size {batch_size}")
         self.steps_per_epoch = total // batch_size

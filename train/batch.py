@@ -5,13 +5,16 @@ Dimensions: B batch, T steps, A action, H W C image.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.pool import ShardPool
+
+# Where a sample comes from; no estimator asks.
+SOURCES = ("episode_id", "block")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,6 +32,8 @@ class Batch:
         next_image: uint8 [B, T, H, W, C], meaningless where terminal; None in episodes and where no target reads it.
         next_step: int64 [B, T]; None as `next_image`.
         mask: bool [B, T], false on padding; None where there is none.
+        more: the pose before the action, `gripper_pose`, and columns of one's own, [B, T, ...] as stored: augmentation
+            leaves them alone.
     """
 
     image: Tensor
@@ -41,6 +46,14 @@ class Batch:
     next_image: Tensor | None = None
     next_step: Tensor | None = None
     mask: Tensor | None = None
+    more: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor]) -> "Batch":
+        """Return the batch of tensors by name; those without an attribute are `more`."""
+        named = {field.name for field in dataclasses.fields(cls)}
+        more = {name: tensor for name, tensor in tensors.items() if name not in named}
+        return cls(**{name: tensor for name, tensor in tensors.items() if name in named}, more=more)
 
     @property
     def real_steps(self) -> Tensor:
@@ -86,15 +99,7 @@ def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> B
         moved = (values.pin_memory() if device.type == "cuda" else values).to(device, non_blocking=True)
         return moved.unsqueeze(1) if transitions else moved
 
-    names = ("image", "step", "action", "reward", "terminal", "mc_return", "synthetic_action")
-    common = {name: tensor(getattr(batch, name)) for name in names}
-    if isinstance(batch, EpisodeBatch):
-        return Batch(**common, mask=tensor(batch.mask))
-    if batch.next_image is None:
-        return Batch(**common)
-    return Batch(**common, next_image=tensor(batch.next_image), next_step=tensor(batch.next_step))
-
-
-def episodes_of_a_batch(pool: ShardPool, transitions: int) -> int:
-    """Return how many whole episodes of the pool have so many transitions on average; at least one, at most all."""
-    return max(1, min(round(transitions * pool.episodes / max(pool.rows, 1)), pool.episodes))
+    arrays = {name: array for name, array in batch.arrays().items() if name not in SOURCES}
+    if "next_image" not in arrays:
+        arrays.pop("next_step", None)
+    return Batch.of({name: tensor(array) for name, array in arrays.items()})
