@@ -41,7 +41,7 @@ class EstimatorSettings(Settings):
 
 S = TypeVar("S", bound=EstimatorSettings)
 Target = Callable[[Batch, Networks, S, torch.Generator, float], Tensor]
-"""(batch, networks, own settings, random numbers, progress in [0, 1)) -> targets, float [B, T]."""
+"""(batch, networks, own settings, random numbers, progress in [0, 1]) -> targets, float [B, T]."""
 
 
 @dataclasses.dataclass(frozen=True)

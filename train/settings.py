@@ -59,7 +59,7 @@ class TrainSettings(Recipe):
         """
         super().__post_init__()
         if not self.shards:
-            raise UserError("shards: expected dataset folders, shard files or globs, got none")
+            raise UserError("--shards: expected dataset folders, shard files or globs, got none")
 
     @property
     def estimator(self) -> Estimator[Any]:
