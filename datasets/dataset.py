@@ -206,7 +206,7 @@ def _agreed(manifest: Manifest) -> dict[str, Any]:
         "simulator versions": manifest.task.get("simulator_version"),
         "task settings": manifest.task,
         "image shapes": manifest.image_shape,
-        "action limits": manifest.action_limits,
+        "action limits": manifest.action.limits,
         "action spaces": manifest.action.to_json(),
         "discounts": manifest.discount,
         "object sets": f"{manifest.object_set.get('name')} ({str(manifest.object_set.get('sha256'))[:16]})",

@@ -58,11 +58,6 @@ class ShardPool:
     _relabels: bool = False
 
     @property
-    def action_limits(self) -> tuple[float, ...]:
-        """What an action of 1 commands, [A] in the units of `action`."""
-        return self.action.limits
-
-    @property
     def rows(self) -> int:
         """Number of transitions."""
         return sum(ref.rows for ref in self.blocks)

@@ -23,7 +23,7 @@ def test_a_pool_names_every_block_with_its_rows_and_episodes(dataset, drawn):
     assert blocks_of(pool) == list(range(12))
     assert [ref.rows for ref in pool.blocks] == [sum(e.steps for e in drawn.episodes(b, 1)) for b in range(12)]
     assert (pool.episodes, pool.max_steps, pool.discount) == (24, 15, 1.0)
-    assert pool.action_limits == drawn.limits
+    assert pool.action.limits == drawn.limits
     assert pool.manifest_digest == Manifest.load(dataset).digest()
 
 
