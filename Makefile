@@ -68,7 +68,7 @@ types: setup
 	@rm -rf .types build
 	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation --target .types .
 	@rm -rf build
-	cd .types && ../$(BIN)/mypy --config-file ../pyproject.toml -p graspq
+	cd .types && ../$(BIN)/mypy --config-file ../pyproject.toml -p graspq && ../$(BIN)/mypy --config-file ../pyproject.toml ../examples
 
 clean: ## remove what can be made again, but for data/ and runs/
 	rm -rf $(VENV) $(VENV)-3.* .types build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -5,12 +5,14 @@ python benchmarks/estimators.py --shards data/regular-10k
 
 import contextlib
 from dataclasses import dataclass
+from functools import partial
 
 from graspq.benchmarks.harness import DataSettings, Ratio, Result, command, compared, median_ratio, take_turns, timed
 from graspq.benchmarks.sessions import ready, steps_on, training_of
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
 from graspq.train.estimators import ESTIMATORS
+from graspq.train.loop import update
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ def measure(settings: EstimatorsSettings) -> Result:
             current = stack.enter_context(training_of(name, settings.shards, pool))
             batches = ready(current, pool, settings.steps)
             real = sum(int(batch.real_steps.sum()) for batch in batches)
-            arms[name] = timed(steps_on(batches, current.update), real)
+            arms[name] = timed(steps_on(batches, partial(update, current)), real)
         seconds = take_turns(arms, settings.turns)
     return Result(
         [

@@ -13,7 +13,7 @@ from torch import Tensor
 from graspq.datasets.pool import ShardPool
 from graspq.train.batch import Batch
 from graspq.train.batches import training_batches
-from graspq.train.loop import Session, session
+from graspq.train.session import Session, session
 from graspq.train.settings import Preset, complete
 
 CPU = torch.device("cpu")
@@ -36,9 +36,7 @@ def training_of(
 @contextlib.contextmanager
 def batches_of(current: Session, pool: ShardPool) -> Iterator[Iterator[Batch]]:
     """Give the batches that a training takes from a pool, from its step on."""
-    pool = pool.with_discount(current.settings.own.chosen_discount(pool.discount))
-    target_value = current.settings.row.target_value
-    with training_batches(pool, current.settings, target_value, CPU, current.state.step) as batches:
+    with training_batches(pool, current.settings, CPU, current.state.step) as batches:
         yield batches
 
 

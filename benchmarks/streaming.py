@@ -7,6 +7,7 @@ import itertools
 import statistics
 import time
 from dataclasses import dataclass
+from functools import partial
 
 from graspq.benchmarks.harness import (
     DataSettings,
@@ -24,6 +25,7 @@ from graspq.benchmarks.loading import BATCH_SIZE, larger
 from graspq.benchmarks.sessions import batches_of, ready, steps_on, training_of
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
+from graspq.train.loop import update
 
 
 @dataclass(frozen=True)
@@ -47,17 +49,17 @@ def waiting_row(algo: str, settings: StreamingSettings) -> Row:
 
         def streamed(turn: int) -> float:
             for batch in itertools.islice(batches, 3):  # those that were fetched meanwhile
-                current.update(batch)["loss"].item()
+                update(current, batch)["loss"].item()
             start, waited = time.perf_counter(), 0.0
             for _ in range(settings.steps):
                 before = time.perf_counter()
                 batch = next(batches)
                 waited += time.perf_counter() - before
-                current.update(batch)["loss"].item()
+                update(current, batch)["loss"].item()
             waits.append(waited / settings.steps)
             return (time.perf_counter() - start) / settings.steps
 
-        arms = {"ready": timed(steps_on(lying, current.update), settings.steps), "streamed": streamed}
+        arms = {"ready": timed(steps_on(lying, partial(update, current)), settings.steps), "streamed": streamed}
         seconds = take_turns(arms, settings.turns)
     return {
         "estimator": algo,
@@ -77,7 +79,7 @@ def memory_row(settings: StreamingSettings) -> Row:
         batches_of(current, wide) as batches,
     ):
         for batch in itertools.islice(batches, settings.memory_steps):
-            current.update(batch)
+            update(current, batch)
             seen.append(resident_bytes() / 1e6)
     quarter = len(seen) // 4
     early, late = statistics.mean(seen[quarter : 2 * quarter]), statistics.mean(seen[-quarter:])

@@ -20,6 +20,7 @@ from graspq.common.errors import UserError
 from graspq.common.options import Settings, setting
 from graspq.common.text import write_jsonl
 from graspq.datasets.dataset import open_shards
+from graspq.train.loop import update
 from graspq.train.settings import Preset
 
 AUC = 0.75  # the bar
@@ -62,7 +63,7 @@ def timed(algo: str, preset: Preset, seed: int, shards: tuple[str, ...], limit: 
         while state.step < whole.steps and seconds < limit and not (marks and marks[-1].auc >= AUC):
             pause, start = min(next_validation(state.step, whole.batch_size), whole.steps), time.perf_counter()
             while state.step < pause and seconds + time.perf_counter() - start < limit:
-                current.update(next(batches))["loss"].item()
+                update(current, next(batches))["loss"].item()
             seconds += time.perf_counter() - start
             result = current.validate()
             if result is None or result.roc_auc_last_step is None:

@@ -9,6 +9,7 @@ import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -36,8 +37,8 @@ from graspq.train import augment, estimator, loop
 from graspq.train.batch import Batch
 from graspq.train.device import Precision
 from graspq.train.estimator import targets_of
-from graspq.train.loop import Session
 from graspq.train.selection import uniform_actions
+from graspq.train.session import Session
 from graspq.train.state import seeded
 
 OURS, PLAIN, TILED, D3RLPY = "graspq", "plain PyTorch", "plain PyTorch, 16 tiled copies", "d3rlpy"
@@ -81,7 +82,7 @@ def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> Non
     if plain.dql is not None:
         precise = dataclasses.replace(networks, precision=Precision("float32", CPU))
         networks.q.eval()
-        target = targets_of(settings.row, batch, precise, settings.own, seeded("benchmarks/candidates"), 0.0)
+        target = targets_of(settings.estimator, batch, precise, settings.own, seeded("benchmarks/candidates"), 0.0)
         candidates = uniform_actions(seeded("benchmarks/candidates"), rows, plain.dql.candidates, action.shape[1])
         asked = plain.double_q(theirs, theirs["next_image"].float(), candidates, plain.dql.discount)
         check_equal(target, {"the target of plain dql": asked})
@@ -90,10 +91,10 @@ def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> Non
 def rivals_of(current: Session, batches: Sequence[Batch]) -> dict[str, Callable[[int], float]]:
     """Return what trains ours and its rivals for one estimator; of each the seconds of a transition."""
     algo, size, theirs = current.settings.algo, len(batches[0].action), [plain_batch(batch) for batch in batches]
-    arms = {OURS: timed(steps_on(batches, current.update), size * len(batches))}
+    arms = {OURS: timed(steps_on(batches, partial(loop.update, current)), size * len(batches))}
     if algo == "ddpg":
-        update = update_by_d3rlpy(theirs)
-        return arms if update is None else arms | {D3RLPY: timed(update, size * len(batches))}
+        rival = update_by_d3rlpy(theirs)
+        return arms if rival is None else arms | {D3RLPY: timed(rival, size * len(batches))}
     for name in (PLAIN, TILED) if algo == "dql" else (PLAIN,):
         copied = plain_copy(current.state.networks.q, current.state.networks.specification.steps - 1)
         plain = PlainTraining(copied, current.settings, tiled=name == TILED)
@@ -105,7 +106,7 @@ def rivals_of(current: Session, batches: Sequence[Batch]) -> dict[str, Callable[
 
 def pieces_row(current: Session, batches: Sequence[Batch]) -> Row:
     """Return the mean milliseconds of the pieces of a step, over batches that are trained on once before."""
-    train = steps_on(batches, current.update)
+    train = steps_on(batches, partial(loop.update, current))
     train()
     with Stopwatch("rest", time.perf_counter) as watch:
         for owner, name, piece in (

@@ -29,13 +29,14 @@ from graspq.datagen.shards import (
 )
 from graspq.datasets.card import write_card
 from graspq.datasets.episode import Episode
-from graspq.datasets.manifest import MANIFEST_NAME, Manifest
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, require_same
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.objects.defaults import default_object_set
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.task import Task, task_named
 
 VERSIONS = ("numpy", "scipy", "pybullet", "pybullet-arm64", "pyarrow", "trimesh")
+OTHERWISE = "use the same, or another --out"
 
 
 def make_dataset(settings: DatagenSettings) -> Manifest:
@@ -53,7 +54,7 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     fresh = describe(settings, task, objects)
     plan = plan_shards(settings.collection(), settings.size)
     if existing is not None:
-        _require_same(folder, existing, fresh)
+        require_same(folder, existing, fresh, OTHERWISE)
         if not missing_shards(plan, existing) and existing.files:
             click.echo(f"{folder} is complete: {existing.episodes:,} grasps, {bytes_text(existing.bytes)}")
             return existing
@@ -61,7 +62,7 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     writable_folder(folder, "dataset")
     with locked(folder, "grasp-datagen"):
         manifest = _existing(folder) or fresh
-        _require_same(folder, manifest, fresh)
+        require_same(folder, manifest, fresh, OTHERWISE)
         missing = missing_shards(plan, manifest)
         _announce(settings, folder, missing)
         remove_leftovers(folder)
@@ -121,27 +122,6 @@ def _object_set(settings: DatagenSettings, task: Task, folder: Path, existing: M
     if existing is not None and (folder / "objects" / "object_set.json").is_file():
         return ObjectSet.load(folder / "objects")
     return default_object_set(task.object_set)
-
-
-def _require_same(folder: Path, existing: Manifest, fresh: Manifest) -> None:
-    """Refuse to mix data that were made differently."""
-    for what, name in (
-        ("task", "task"),
-        ("settings", "settings"),
-        ("object set", "object_set"),
-        ("discount", "discount"),
-        ("versions", "versions"),
-    ):
-        there, here = getattr(existing, name), getattr(fresh, name)
-        if there == here:
-            continue
-        if isinstance(there, dict):
-            keys = [key for key in {**there, **here} if there.get(key) != here.get(key)]
-            what, there, here = f"{what} ({keys[0]})", there.get(keys[0]), here.get(keys[0])
-        raise UserError(
-            f"{folder}: holds a dataset with another {what}: {there} there, {here} asked for; "
-            "use the same, or another --out"
-        )
 
 
 def _check_space(settings: DatagenSettings, folder: Path, existing: Manifest | None) -> None:

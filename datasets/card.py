@@ -3,6 +3,7 @@
 Its text depends on the manifest alone. The manifest lists its digest, so that `verify` covers it.
 """
 
+import bisect
 import dataclasses
 import hashlib
 import math
@@ -16,8 +17,7 @@ from graspq.datasets.columns import VARYING, Column, Sizes, quantities, sizes_of
 from graspq.datasets.manifest import Manifest, steps_file
 
 CARD_NAME = "README.md"
-SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-LARGER_SIZES = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"))
+SIZE_CATEGORIES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "n>100M")
 
 # Older versions of Hugging Face `datasets` cannot infer a fixed-size binary column: the types are declared therefore.
 TEMPLATE = """\
@@ -111,7 +111,7 @@ def card_text(manifest: Manifest) -> str:
         episodes=manifest.episodes,
         rows=manifest.rows,
         success=manifest.successes / manifest.episodes,
-        size=_size_category(manifest.rows),
+        size=SIZE_CATEGORIES[bisect.bisect([10**power for power in range(3, 9)], manifest.rows)],
         objects=manifest.object_set["name"],
         first_shard=steps_file(manifest.shards[0].name),
         limits=quantities(action.limits, action.units),
@@ -162,7 +162,3 @@ def _feature(dtype: str, dimensions: tuple[int, ...]) -> list[str]:
     length, *inner = dimensions
     nested = ["list:", *(f"  {line}" for line in _feature(dtype, tuple(inner)))] if inner else [f"list: {dtype}"]
     return nested + [f"length: {length}"] * (length != VARYING)
-
-
-def _size_category(rows: int) -> str:
-    return next((name for limit, name in SIZES + LARGER_SIZES if rows < limit), "n>100M")

@@ -137,7 +137,7 @@ def _mc_return(steps: Row, episode: Row, manifest: Manifest) -> Any:
 
 def _synthetic_action(steps: Row, episode: Row, manifest: Manifest) -> Any:
     final_pose = np.asarray(episode["final_pose"], np.float32)
-    return synthetic_action(steps["gripper_pose"], final_pose, manifest.action_limits)
+    return synthetic_action(steps["gripper_pose"], final_pose, manifest.action.limits)
 
 
 # fmt: off

@@ -122,7 +122,7 @@ def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPoo
         UserError: a pattern matches nothing, something is no dataset or is damaged, or datasets do not fit together.
     """
     if not patterns:
-        raise UserError("--shards: expected dataset folders, shard files or globs, got none")
+        raise UserError("shards: expected dataset folders, shard files or globs, got none")
     opened: dict[Path, list[Shard]] = {}
     found = [shard for pattern in patterns for path in _matches(str(pattern)) for shard in _shards(path, opened)]
     # By content: a copy of a shard under another name is the same shard; the one named first counts.
@@ -140,7 +140,7 @@ def _matches(pattern: str) -> list[Path]:
     root = Path(path.anchor) if path.is_absolute() else Path()
     matches = sorted(root.glob(str(path.relative_to(path.anchor) if path.is_absolute() else path)))
     if not matches:
-        raise UserError(f"--shards: {pattern}: no such folder or file; expected a dataset folder, a shard or a glob")
+        raise UserError(f"{pattern}: no such folder or file; expected a dataset folder, a shard or a glob")
     return matches
 
 
@@ -194,7 +194,7 @@ def _check_agreement(shards: list[Shard]) -> None:
         for what, ours in _agreed(first.manifest).items():
             if ours != theirs[what]:
                 raise UserError(
-                    f"--shards: cannot mix {what}: {first.folder} has {_shown(ours, theirs[what])}, "
+                    f"cannot mix {what}: {first.folder} has {_shown(ours, theirs[what])}, "
                     f"{other.folder} has {_shown(theirs[what], ours)}; train on one of them"
                 )
 
@@ -206,7 +206,7 @@ def _agreed(manifest: Manifest) -> dict[str, Any]:
         "simulator versions": manifest.task.get("simulator_version"),
         "task settings": manifest.task,
         "image shapes": manifest.image_shape,
-        "action limits": manifest.action_limits,
+        "action limits": manifest.action.limits,
         "action spaces": manifest.action.to_json(),
         "discounts": manifest.discount,
         "object sets": f"{manifest.object_set.get('name')} ({str(manifest.object_set.get('sha256'))[:16]})",

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from graspq.common.action_space import ActionSpace, grasping
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, refuse_other
 from graspq.common.files import read_json, write_json
 
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
 SHARD_NAME = re.compile(r"blocks-\d{6,}-\d{6,}(-short-\d+)?")
+DECIDING = ("task", "settings", "object_set", "discount", "versions")
 REMEDY = "copy the dataset again, or make it again with the command that made it"
 
 
@@ -121,11 +122,6 @@ class Manifest:
             following = entry.first_block + entry.blocks
 
     @property
-    def action_limits(self) -> tuple[float, ...]:
-        """What an action of 1 commands, [A] in the units of `action`."""
-        return self.action.limits
-
-    @property
     def block_size(self) -> int:
         """Episodes of a whole block."""
         return int(self.settings["block_size"])
@@ -164,7 +160,7 @@ class Manifest:
         """Return plain JSON values, without the digest."""
         values = {name.name: getattr(self, name.name) for name in dataclasses.fields(self)}
         if not values.pop("tells_action"):
-            limits = {"action": ("action_limits", list(self.action_limits))}
+            limits = {"action": ("action_limits", list(self.action.limits))}
             values = dict(limits.get(name, (name, value)) for name, value in values.items())
         else:
             values["action"] = self.action.to_json()
@@ -242,6 +238,12 @@ class Manifest:
         others = [other for other in self.shards if other.first_block != entry.first_block]
         shards = sorted([*others, entry], key=lambda shard: shard.first_block)
         return dataclasses.replace(self, shards=tuple(shards))
+
+
+def require_same(folder: Path, existing: Manifest, fresh: Manifest, way_out: str) -> None:
+    """Refuse to add to a dataset that was made otherwise; see `refuse_other`."""
+    theirs, ours = ({name: getattr(one, name) for name in DECIDING} for one in (existing, fresh))
+    refuse_other(folder, "grasps made", theirs, ours, way_out)
 
 
 def _digest_of(values: dict[str, Any]) -> str:

@@ -58,11 +58,6 @@ class ShardPool:
     _relabels: bool = False
 
     @property
-    def action_limits(self) -> tuple[float, ...]:
-        """What an action of 1 commands, [A] in the units of `action`."""
-        return self.action.limits
-
-    @property
     def rows(self) -> int:
         """Number of transitions."""
         return sum(ref.rows for ref in self.blocks)
@@ -154,7 +149,7 @@ class ShardPool:
             UserError: the fraction is outside [0, 1).
         """
         if not 0.0 <= fraction < 1.0:
-            raise UserError(f"--validation-fraction: expected a number in [0, 1), got {fraction}")
+            raise UserError(f"fraction: expected a number in [0, 1), got {fraction}")
         ranked = sorted(self.blocks, key=lambda ref: _fraction(seed, ref))
         count = sum(_fraction(seed, ref) < fraction for ref in ranked)
         if fraction > 0 and len(ranked) > 1:

@@ -4,8 +4,8 @@ Blocks are permuted and cut into windows that fit the buffer; within a window ev
 random order, so that a batch mixes many blocks.
 """
 
+import functools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -56,13 +56,14 @@ class Sampler:
         self.item_offsets: Int64 = np.concatenate([[0], np.cumsum(self._items)]).astype(np.int64)
         total = int(self._items.sum())
         if not 1 <= batch_size <= total:
-            raise UserError(f"--batch-size: expected 1 to {total}, the number of samples in the data, got {batch_size}")
+            raise UserError(f"batch_size: expected 1 to {total}, the number of samples in the data, got {batch_size}")
         if not 0 <= rank < ranks <= batch_size:
             raise UserError(f"rank {rank} of {ranks}: expected 0 <= rank < ranks <= batch size {batch_size}")
         self.steps_per_epoch = total // batch_size
         self.windows_per_epoch = self._count_windows(buffer_rows)
-        self._epochs: dict[int, tuple[list[Int64], Int64]] = {}
-        self._orders: dict[tuple[int, int], Int64] = {}
+        # Kept for as many windows and epochs as two neighbouring batches touch.
+        self._window_order = functools.lru_cache(3)(self._spread)
+        self._plan = functools.lru_cache(2)(self._planned)
 
     def _count_windows(self, buffer_rows: int) -> int:
         blocks, total = len(self._rows), int(self._rows.sum())
@@ -116,12 +117,6 @@ class Sampler:
         """Return this rank's part of the batch, int64 [about batch_size / ranks]."""
         return np.array_split(self.global_indices(epoch, step), self.ranks)[self.rank]
 
-    def _window_order(self, epoch: int, window: int) -> Int64:
-        if (epoch, window) not in self._orders:
-            self._orders[epoch, window] = self._spread(epoch, window)
-            _forget_all_but(self._orders, 3)
-        return self._orders[epoch, window]
-
     def _spread(self, epoch: int, window: int) -> Int64:
         """Return the window's items in an order in which every block's items are evenly spread.
 
@@ -139,17 +134,8 @@ class Sampler:
         keys = (np.arange(len(owner)) - starts + rng.random(len(owner))) / counts[owner]
         return by_block[np.argsort(keys, kind="stable")]
 
-    def _plan(self, epoch: int) -> tuple[list[Int64], Int64]:
-        if epoch not in self._epochs:
-            order = generator("datasets/blocks", self.seed, epoch).permutation(len(self._rows)).astype(np.int64)
-            windows = list(np.array_split(order, self.windows_per_epoch))
-            counts = [int(self._items[blocks].sum()) for blocks in windows]
-            self._epochs[epoch] = windows, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-            _forget_all_but(self._epochs, 2)
-        return self._epochs[epoch]
-
-
-def _forget_all_but(cache: dict[Any, Any], count: int) -> None:
-    """Drop the oldest entries: what was dropped is computed again where it is needed."""
-    while len(cache) > count:
-        cache.pop(next(iter(cache)))
+    def _planned(self, epoch: int) -> tuple[list[Int64], Int64]:
+        order = generator("datasets/blocks", self.seed, epoch).permutation(len(self._rows)).astype(np.int64)
+        windows = list(np.array_split(order, self.windows_per_epoch))
+        counts = [int(self._items[blocks].sum()) for blocks in windows]
+        return windows, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

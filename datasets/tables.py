@@ -74,7 +74,7 @@ def _schema(manifest: Manifest, table: str, described: Sequence[Column]) -> pa.S
     ]
     facts = {
         "image_shape": list(manifest.image_shape),
-        "action_limits": list(manifest.action_limits),
+        "action_limits": list(manifest.action.limits),
         "discount": manifest.discount,
         **columns.phi_range(manifest),
     }

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, Metrics, TargetValue, loss_of, targets_of
 from graspq.train.estimators import dql
 from graspq.train.networks.network import Features, NetworkSpecification, QNetwork
-from graspq.train.selection import StochasticSearch, uniform_actions
+from graspq.train.selection import uniform_actions
 from graspq.train.state import TrainState
 
 
@@ -35,7 +36,6 @@ class SmallNetwork(QNetwork):
     def __init__(self, specification: NetworkSpecification) -> None:
         super().__init__()
         height, width, channels = specification.image_shape
-        self.link = specification.link
         self.convolutions = nn.Sequential(
             nn.Conv2d(channels, 16, 4, 4), nn.ReLU(), nn.Conv2d(16, 32, 3, 2, 1), nn.ReLU(), nn.Flatten()
         )

@@ -21,7 +21,8 @@ class QNetwork(nn.Module):
     def forward(self, image: Tensor, step: Tensor, action: Tensor) -> Tensor:
         """Return Q, float32 [B], of images uint8 [B, H, W, 3], steps int64 [B] and actions float32 [B, A]."""
         seen = self.image(image.permute(0, 3, 1, 2) / 255)
-        return self.value(torch.cat([seen, step[:, None], action], 1)).squeeze(1)
+        q: Tensor = self.value(torch.cat([seen, step[:, None], action], 1))
+        return q.squeeze(1)
 
 
 def squared_error(batch: dict[str, Tensor]) -> Tensor:
@@ -37,7 +38,7 @@ with training.batches(batch_size=64, seed=0, need_next=False) as batches:
     for number, batch in enumerate(itertools.islice(batches, int(sys.argv[2]))):
         loss = squared_error(batch.tensors())
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         if number % 50 == 0:
             print(f"step {number}: squared error {loss.item():.4f}")

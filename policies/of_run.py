@@ -7,20 +7,18 @@ import copy
 import dataclasses
 import io
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 
-from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.errors import UserError
 from graspq.sim.observation import Observation
 from graspq.sim.task import task_from_json
+from graspq.train.acting import Acting, ActionSelection, ObservedState, StochasticSearch
+from graspq.train.device import Device, chosen_device
 from graspq.train.networks.network import NetworkSpecification
 from graspq.train.search_settings import CemSettings
-from graspq.train.selection import Acting, ActionSelection, StochasticSearch
-
-Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,9 +68,7 @@ class RunPolicy:
         """
         self.origin, self.acting, self.selection, self.cem, self.device = origin, acting, selection, cem, device
         self.q: float | None = None
-        if device == "cuda" and not torch.cuda.is_available():
-            raise UserError("--device cuda: PyTorch finds no GPU here; use --device cpu")
-        self._device = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+        self._device = chosen_device(device)
         self._placed: Acting | None = None
 
     @property
@@ -99,7 +95,7 @@ class RunPolicy:
             image = torch.from_numpy(np.ascontiguousarray(observation.image)).to(self._device).unsqueeze(0)
             step = torch.tensor([observation.step], device=self._device)
             pose = torch.from_numpy(np.asarray(observation.gripper_pose)).to(self._device).unsqueeze(0)
-            action, q = self.selection.act(self._placed, image, step, pose, rng, self.cem)
+            action, q = self.selection.act(self._placed, ObservedState(image, step, pose), rng, self.cem)
             self.q = None if q is None else float(q[0])
             answer: np.ndarray = action[0].float().cpu().numpy()
         return answer
@@ -143,12 +139,10 @@ def load(
         raise UserError(f"{path}: a checkpoint, expected its run; name {run} with --checkpoint STEP")
     loaded = load_acting(path, checkpoint)
     try:
-        algo, dataset = str(loaded.config["settings"]["algo"]), loaded.config["dataset"]
-        task, described = dict(dataset["task"]), dataset.get("action")
-        action = grasping(tuple(dataset["action_limits"])) if described is None else ActionSpace.from_json(described)
+        algo, task = str(loaded.config["settings"]["algo"]), dict(loaded.config["dataset"]["task"])
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{Path(path) / 'config.json'}: not the configuration of a training run ({error!r})") from None
-    acting = Acting(loaded.networks, loaded.kept, action, _pose_bounds(task))
+    acting = Acting(loaded.networks, loaded.kept, loaded.specification.action, _pose_bounds(task))
     origin = Origin(algo, loaded.step, loaded.sha256, task, loaded.config, loaded.specification)
     selection = estimator_named(algo).action_selection
     return RunPolicy(origin, acting, selection, cem if cem is not None else CemSettings(), device)

@@ -4,13 +4,17 @@ Dimensions: B batch, T steps, A action, H W C image.
 """
 
 import dataclasses
+import functools
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from graspq.datasets.batch import EpisodeBatch, TransitionBatch
-from graspq.datasets.pool import ShardPool
+
+# Where a sample comes from; no estimator asks.
+SOURCES = ("episode_id", "block")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,6 +32,8 @@ class Batch:
         next_image: uint8 [B, T, H, W, C], meaningless where terminal; None in episodes and where no target reads it.
         next_step: int64 [B, T]; None as `next_image`.
         mask: bool [B, T], false on padding; None where there is none.
+        more: the pose before the action, `gripper_pose`, and columns of one's own, [B, T, ...] as stored: augmentation
+            leaves them alone.
     """
 
     image: Tensor
@@ -40,23 +46,44 @@ class Batch:
     next_image: Tensor | None = None
     next_step: Tensor | None = None
     mask: Tensor | None = None
+    more: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor]) -> "Batch":
+        """Return the batch of tensors by name; those without an attribute are `more`."""
+        named = {field.name for field in dataclasses.fields(cls)}
+        more = {name: tensor for name, tensor in tensors.items() if name not in named}
+        return cls(**{name: tensor for name, tensor in tensors.items() if name in named}, more=more)
 
     @property
     def real_steps(self) -> Tensor:
         """Number of steps that are no padding, a scalar."""
         return torch.tensor(self.step.numel(), device=self.step.device) if self.mask is None else self.mask.sum()
 
+    @functools.cached_property
+    def later_steps(self) -> Tensor:
+        """Which steps are real and not the first of their episode; bool [B, T]."""
+        later = torch.ones_like(self.terminal) if self.mask is None else self.mask.clone()
+        later[:, 0] = False
+        return later
+
     @property
     def next_states(self) -> tuple[Tensor, Tensor]:
         """Images uint8 [B T, H, W, C] and steps int64 [B T] of s'; a ValueError where the loader left them out."""
         if self.next_image is None or self.next_step is None:
-            raise ValueError("a bootstrapped target needs next_image and next_step in the batch")
+            raise ValueError("no s' in this batch: a target that reads it says so by TargetValue(..., needs_next=True)")
         return self.next_image.flatten(0, 1), self.next_step.flatten()
 
     def real(self, values: Tensor) -> Tensor:
         """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""
         flat = values.flatten(0, 1)
         return flat if self.mask is None else flat[self.mask.flatten()]
+
+    def in_place(self, values: Tensor) -> Tensor:
+        """Return values of the real steps, float [n] or [n, 1], where these stand in [B, T]; 0 on padding."""
+        if self.mask is None:
+            return values.view_as(self.reward)
+        return torch.zeros_like(self.reward).masked_scatter(self.mask, values)
 
 
 def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> Batch:
@@ -72,15 +99,7 @@ def to_tensors(batch: TransitionBatch | EpisodeBatch, device: torch.device) -> B
         moved = (values.pin_memory() if device.type == "cuda" else values).to(device, non_blocking=True)
         return moved.unsqueeze(1) if transitions else moved
 
-    names = ("image", "step", "action", "reward", "terminal", "mc_return", "synthetic_action")
-    common = {name: tensor(getattr(batch, name)) for name in names}
-    if isinstance(batch, EpisodeBatch):
-        return Batch(**common, mask=tensor(batch.mask))
-    if batch.next_image is None:
-        return Batch(**common)
-    return Batch(**common, next_image=tensor(batch.next_image), next_step=tensor(batch.next_step))
-
-
-def episodes_of_a_batch(pool: ShardPool, transitions: int) -> int:
-    """Return how many whole episodes of the pool have so many transitions on average; at least one, at most all."""
-    return max(1, min(round(transitions * pool.episodes / max(pool.rows, 1)), pool.episodes))
+    arrays = {name: array for name, array in batch.arrays().items() if name not in SOURCES}
+    if "next_image" not in arrays:
+        arrays.pop("next_step", None)
+    return Batch.of({name: tensor(array) for name, array in arrays.items()})

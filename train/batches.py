@@ -7,13 +7,11 @@ import contextlib
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from typing import Any
 
 import torch
 
 from graspq.datasets.pool import ShardPool
-from graspq.train.batch import Batch, episodes_of_a_batch, to_tensors
-from graspq.train.estimator import TargetValue
+from graspq.train.batch import Batch, to_tensors
 from graspq.train.parallel import ALONE, Ranks
 from graspq.train.resident import ResidentPool
 from graspq.train.settings import TrainSettings
@@ -23,19 +21,13 @@ VALIDATION_ROWS = 8192
 
 @contextlib.contextmanager
 def training_batches(
-    pool: ShardPool,
-    settings: TrainSettings,
-    wanted: TargetValue[Any],
-    device: torch.device,
-    start_step: int,
-    ranks: Ranks = ALONE,
+    pool: ShardPool, settings: TrainSettings, device: torch.device, start_step: int, ranks: Ranks = ALONE
 ) -> Iterator[Iterator[Batch]]:
     """Give the endless batches of a training, this rank's part of each, from the step `start_step` on.
 
     Args:
         pool: what to train on.
-        settings: of the run.
-        wanted: says whether a batch holds transitions or episodes, and whether it needs s'.
+        settings: of the run; its estimator says whether a batch holds transitions or episodes, and what it reads.
         device: where the batches lie.
         start_step: of the first batch.
         ranks: those that share each batch.
@@ -43,43 +35,49 @@ def training_batches(
     Raises:
         UserError: a batch is larger than the data, the buffer too small, or a shard is damaged.
     """
-    resident = settings.resident
+    pool, target_value, resident = _with_returns(pool, settings), settings.estimator.target_value, settings.resident
     # Of a pool on the device the loader gives the order alone, and reads nothing.
     with pool.batches(
-        batch_rows(pool, settings, wanted),
+        batch_items(pool, settings),
         settings.seed,
-        view=wanted.view,
+        view=target_value.view,
         buffer_bytes=settings.buffer_bytes,
         start_step=start_step,
         rank=ranks.rank,
         ranks=ranks.count,
         prefetch=0 if resident else 2,
-        need_next=wanted.needs_next,
+        need_next=target_value.needs_next,
     ) as loader:
         if not resident:
             yield (to_tensors(batch, device) for batch in loader)
             return
         held, sampler = ResidentPool.read(pool, device), loader.sampler
         indices = (sampler.indices(*sampler.position(step)) for step in itertools.count(start_step))
-        if wanted.view == "episodes":
+        if target_value.view == "episodes":
             yield (held.episodes(index) for index in indices)
         else:
-            yield (held.transitions(index, wanted.needs_next) for index in indices)
+            yield (held.transitions(index, target_value.needs_next) for index in indices)
 
 
-def batch_rows(pool: ShardPool, settings: TrainSettings, wanted: TargetValue[Any]) -> int:
-    """Return the rows of a batch over all ranks: `batch_size` transitions, or about so many in whole episodes."""
-    if wanted.view == "transitions":
+def batch_items(pool: ShardPool, settings: TrainSettings) -> int:
+    """Return the items of a batch over all ranks: `batch_size` transitions, or episodes with so many on average."""
+    if settings.estimator.target_value.view == "transitions":
         return settings.batch_size
-    return episodes_of_a_batch(pool, settings.batch_size)
+    return max(1, min(round(settings.batch_size * pool.episodes / max(pool.rows, 1)), pool.episodes))
 
 
-def held_back_batches(
-    held_back: ShardPool, settings: TrainSettings, wanted: TargetValue[Any], device: torch.device
-) -> Iterator[Batch]:
+def _with_returns(pool: ShardPool, settings: TrainSettings) -> ShardPool:
+    """Return the pool with returns of the run's discount, where the target reads them."""
+    if not settings.estimator.target_value.needs_return:
+        return pool
+    return pool.with_discount(settings.own.chosen_discount(pool.discount))
+
+
+def held_back_batches(held_back: ShardPool, settings: TrainSettings, device: torch.device) -> Iterator[Batch]:
     """Yield the batches of a validation: the first blocks that have at most `VALIDATION_ROWS` rows."""
+    held_back, target_value = _with_returns(held_back, settings), settings.estimator.target_value
     rows = itertools.accumulate(ref.rows for ref in held_back.blocks)
     kept = sum(1 for total in rows if total <= VALIDATION_ROWS)
     pool = dataclasses.replace(held_back, blocks=held_back.blocks[: max(kept, 1)])
-    batches = pool.once(batch_rows(pool, settings, wanted), view=wanted.view, need_next=wanted.needs_next)
+    batches = pool.once(batch_items(pool, settings), view=target_value.view, need_next=target_value.needs_next)
     yield from (to_tensors(batch, device) for batch in batches)

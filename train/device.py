@@ -11,16 +11,18 @@ import torch
 from graspq.common.errors import UserError
 from graspq.common.files import cache_folder
 
+Device = Literal["auto", "cpu", "cuda"]
 
-def chosen_device(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
-    """Return the device of `--device`.
+
+def chosen_device(name: Device) -> torch.device:
+    """Return a device by its name; `auto` takes a GPU if there is one.
 
     Raises:
         UserError: a GPU was asked for and there is none.
     """
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
-        raise UserError("--device: cuda was asked for but torch sees no GPU; use --device cpu or auto")
+        raise UserError("device: cuda was asked for but torch sees no GPU; use cpu or auto")
     return torch.device("cuda" if name != "cpu" and available else "cpu")
 
 

@@ -5,7 +5,7 @@ losses and the regression. Dimensions: B batch, T steps, A action, n real steps 
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Generic, Literal, TypeVar
 
 import torch
@@ -13,13 +13,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from graspq.common.options import Settings, setting
-from graspq.common.text import markdown
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import ActionSelection
 from graspq.train.batch import Batch
 from graspq.train.networks import Parts, q_network
 from graspq.train.networks.network import Link
 from graspq.train.recipe import PAPER, Recipe
-from graspq.train.selection import ActionSelection
 from graspq.train.state import Networks, TrainState
 
 Metrics = dict[str, Tensor]
@@ -28,21 +27,21 @@ Metrics = dict[str, Tensor]
 
 @dataclasses.dataclass(frozen=True)
 class EstimatorSettings(Settings):
-    """Options of one estimator; they follow the common ones in `grasp-train --algo NAME --help`.
+    """Options of one estimator; they follow the common ones in `grasp-train --algo NAME --help`."""
 
-    Two names mean something to the loop: `discount` is that of the returns in a batch, and with `lag_steps` there are
-    lagged copies of the networks, which follow after so many steps.
-    """
+    @property
+    def lag(self) -> int | None:
+        """Steps between copies of the weights into lagged networks; None: there are none."""
+        return None
 
     def chosen_discount(self, stored: float) -> float:
-        """Return γ of the run's `mc_return`; `stored` is that of the dataset's own."""
-        discount = getattr(self, "discount", None)
-        return stored if discount is None else float(discount)
+        """Return γ of the run; `stored` is that of the dataset's own returns."""
+        return stored
 
 
 S = TypeVar("S", bound=EstimatorSettings)
 Target = Callable[[Batch, Networks, S, torch.Generator, float], Tensor]
-"""(batch, networks, own settings, random numbers, progress in [0, 1)) -> targets, float [B, T]."""
+"""(batch, networks, own settings, random numbers, progress in [0, 1]) -> targets, float [B, T]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +53,7 @@ class TargetValue(Generic[S]):
         target: see `Target`; called without gradient, all networks in evaluation mode.
         view: what a batch holds: single transitions (T = 1), or whole episodes, of about `--batch-size` transitions.
         needs_next: whether the target reads s'; in episodes that is the next step, where the mask is true.
+        needs_return: whether it reads `mc_return`, which is then made with the run's discount; else it is as stored.
 
     Raises:
         ValueError: s' is asked of episodes.
@@ -63,6 +63,7 @@ class TargetValue(Generic[S]):
     target: Target[S]
     view: Literal["transitions", "episodes"] = "transitions"
     needs_next: bool = False
+    needs_return: bool = True
 
     def __post_init__(self) -> None:
         """Check that a batch can hold what the target reads."""
@@ -108,16 +109,20 @@ class RegressionSettings(EstimatorSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class LaggedSettings(RegressionSettings):
-    """Options of an estimator whose target asks a lagged copy of the networks."""
+class LaggedSettings(EstimatorSettings):
+    """Options of an estimator whose target asks lagged copies of its networks."""
 
     discount: float = setting(0.9, help="Discount.", minimum=0, maximum=1)
-    lag_steps: int = setting(50, help="Steps between copies of the weights into the lagged network.", minimum=1)
+    lag_steps: int = setting(50, help="Steps between copies of the weights into the lagged networks.", minimum=1)
 
+    @property
+    def lag(self) -> int:
+        """`lag_steps`."""
+        return self.lag_steps
 
-def logged_action(batch: Batch) -> Tensor:
-    """Return the actions that were taken; float32 [B, T, A]."""
-    return batch.action
+    def chosen_discount(self, stored: float) -> float:
+        """Return γ of the targets."""
+        return self.discount
 
 
 def chosen_loss(settings: Any) -> Loss:
@@ -125,32 +130,23 @@ def chosen_loss(settings: Any) -> Loss:
     return LOSSES[settings.loss]
 
 
-def nothing_kept(pool: ShardPool, settings: Any) -> dict[str, Tensor]:
-    """Return no tensors: most estimators keep their networks alone."""
-    return {}
-
-
 def regression(
-    row: "Estimator[S]", state: TrainState, batch: Batch, settings: S, random: torch.Generator, progress: float
+    estimator: "Estimator[S]", state: TrainState, batch: Batch, settings: S, random: torch.Generator, progress: float
 ) -> Metrics:
     """Take one gradient step on the mean loss between Q_θ(s, a) and the estimator's target.
 
     θ ← θ - optimiser(∇_θ mean ℓ(Q_θ(s_t, a_t), y_t)),  y_t fixed
     """
-    networks = state.networks
-    target = targets_of(row, batch, networks, settings, random, progress)
-    networks.q.train()
-    metrics = loss_of(row, batch, target, networks, settings)
-    state.descend("q", metrics["loss"])
-    return {name: value.detach() for name, value in metrics.items()}
+    target = targets_of(estimator, batch, state.networks, settings, random, progress)
+    return step_towards(estimator, state, batch, target, settings)
 
 
 def regression_objective(
-    row: "Estimator[S]", batch: Batch, networks: Networks, settings: S, random: torch.Generator, progress: float
+    estimator: "Estimator[S]", batch: Batch, networks: Networks, settings: S, random: torch.Generator, progress: float
 ) -> Tensor:
     """Return the mean loss between Q_θ(s, a) and the estimator's target, a scalar."""
-    target = targets_of(row, batch, networks, settings, random, progress)
-    return loss_of(row, batch, target, networks, settings)["loss"]
+    target = targets_of(estimator, batch, networks, settings, random, progress)
+    return loss_of(estimator, batch, target, networks, settings)["loss"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,14 +157,14 @@ class Estimator(Generic[S]):
         summary: one line for people.
         settings: its options.
         target_value: what Q is regressed onto.
-        action_selection: how its policy finds an action.
+        action_selection: how its policy finds an action; training never asks.
         paper: its options with `--preset paper`.
         paper_recipe: the common options with `--preset paper`, where the authors' code has others for this estimator.
-        action: the action whose Q is regressed onto the target; float [B, T, A].
-        loss: own settings -> the loss.
-        parts: its networks.
-        kept: (training data, own settings) -> tensors that are kept beside the networks from the start.
-        update: one step of training; returns metrics.
+        regressed_action: the action whose Q is regressed onto the target, float [B, T, A]; the logged one.
+        loss: own settings -> the loss; that of `LOSSES` which they name.
+        parts: its networks; Q(s, a) of `--network`.
+        kept: (training data, own settings) -> tensors that are kept beside the networks from the start; none.
+        update: one step of training, returns metrics; one of its own need not ask `target_value.target`.
         objective: the loss that validation reports, mean over a batch; changes nothing.
     """
 
@@ -178,34 +174,36 @@ class Estimator(Generic[S]):
     action_selection: ActionSelection
     paper: S
     paper_recipe: Recipe = PAPER
-    action: Callable[[Batch], Tensor] = logged_action
+    regressed_action: Callable[[Batch], Tensor] = lambda batch: batch.action
     loss: Callable[[S], Loss] = chosen_loss
     parts: Parts = dataclasses.field(default_factory=lambda: {"q": q_network})
-    kept: Callable[[ShardPool, S], dict[str, Tensor]] = nothing_kept
+    kept: Callable[[ShardPool, S], dict[str, Tensor]] = lambda pool, settings: {}
     update: Callable[["Estimator[S]", TrainState, Batch, S, torch.Generator, float], Metrics] = regression
     objective: Callable[["Estimator[S]", Batch, Networks, S, torch.Generator, float], Tensor] = regression_objective
 
 
 def targets_of(
-    row: Estimator[S], batch: Batch, networks: Networks, settings: S, random: torch.Generator, progress: float
+    estimator: Estimator[S], batch: Batch, networks: Networks, settings: S, random: torch.Generator, progress: float
 ) -> Tensor:
     """Return the estimator's target of every real step, float32 [n], without gradient; leaves networks in eval mode."""
     for network in networks.online.values():
         network.eval()
     with torch.no_grad(), networks.autocast():
-        return batch.real(row.target_value.target(batch, networks, settings, random, progress)).float()
+        return batch.real(estimator.target_value.target(batch, networks, settings, random, progress)).float()
 
 
-def loss_of(row: Estimator[S], batch: Batch, target: Tensor, networks: Networks, settings: S) -> Metrics:
+def step_towards(estimator: Estimator[S], state: TrainState, batch: Batch, target: Tensor, settings: S) -> Metrics:
+    """Take one gradient step of Q_θ towards targets of the real steps, float32 [n]."""
+    state.networks.q.train()
+    metrics = loss_of(estimator, batch, target, state.networks, settings)
+    state.descend("q", metrics["loss"])
+    return {name: value.detach() for name, value in metrics.items()}
+
+
+def loss_of(estimator: Estimator[S], batch: Batch, target: Tensor, networks: Networks, settings: S) -> Metrics:
     """Return the mean loss of Q_θ, as it stands, against targets [n], and mean |Q| and |target|; float32 scalars."""
     with networks.autocast():
-        output = networks.q(batch.real(batch.image), batch.real(batch.step), batch.real(row.action(batch)))
-    output = output.float()
+        action = batch.real(estimator.regressed_action(batch))
+        output = networks.q(batch.real(batch.image), batch.real(batch.step), action).float()
     q = networks.q.value_of(output.detach()).abs().mean()
-    return {"loss": row.loss(settings).of(output, target).mean(), "q": q, "target": target.abs().mean()}
-
-
-def as_markdown(rows: Mapping[str, Estimator[Any]]) -> str:
-    """Return the table of estimators in Markdown, as the README shows it."""
-    cells = ((f"`{name}`", row.target_value.words, row.action_selection.words) for name, row in rows.items())
-    return markdown(("`--algo`", "target value", "action selection"), cells)
+    return {"loss": estimator.loss(settings).of(output, target).mean(), "q": q, "target": target.abs().mean()}

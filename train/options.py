@@ -14,7 +14,7 @@ from graspq.train.recipe import PAPER, Recipe
 from graspq.train.settings import TrainSettings, refuse_taken_names, unknown_option
 
 # Common options that stand before `--preset`: what is trained, on what, where to.
-FIRST = 4
+FIRST = ("algo", "shards", "out", "seed")
 PRESET = click.Option(
     ["--preset"],
     type=click.Choice(["default", "paper"]),
@@ -48,13 +48,13 @@ class TrainingCommand(Command):
     def groups(self, ctx: click.Context) -> list[tuple[str, list[click.Parameter]]]:
         """Return the parameters in groups: name of the group, its parameters."""
         algo, network = _chosen(ctx.meta.get("words", []))
-        row = estimator_named(algo) if algo is not None else None
-        found = common_parameters(row)
-        common = [*self.params, *found[:FIRST], PRESET, *found[FIRST:], self.get_help_option(ctx)]
+        estimator = estimator_named(algo) if algo is not None else None
+        found = common_parameters(estimator)
+        common = [*self.params, *found[: len(FIRST)], PRESET, *found[len(FIRST) :], self.get_help_option(ctx)]
         groups = [("Options", [one for one in common if one is not None])]
-        if row is not None:
-            refuse_taken_names(row, network)
-            groups += [(f"Options of --algo {algo}", own_parameters(row))]
+        if algo is not None and estimator is not None:
+            refuse_taken_names(algo, network)
+            groups += [(f"Options of --algo {algo}", own_parameters(estimator))]
             groups += [(f"Options of --network {network}", network_parameters(network))]
         return groups
 
@@ -88,23 +88,23 @@ def _chosen(words: Sequence[str]) -> tuple[str | None, str]:
     return algo, value_of("--network", words) or recipe.network
 
 
-def common_parameters(row: Estimator[Any] | None = None) -> list[click.Parameter]:
+def common_parameters(estimator: Estimator[Any] | None = None) -> list[click.Parameter]:
     """Return the common options of training for a command line; the help shows what either preset gives.
 
     Args:
-        row: the estimator whose values the paper's preset gives, where it is known.
+        estimator: whose values the paper's preset gives, where it is known.
     """
-    paper = row.paper_recipe if row is not None else Estimator.paper_recipe
+    paper = estimator.paper_recipe if estimator is not None else Estimator.paper_recipe
     shown = _shown(Recipe(), paper)
-    first = ("algo", "shards", "out", "seed", *(field.name for field in dataclasses.fields(Recipe)))
+    first = (*FIRST, *(field.name for field in dataclasses.fields(Recipe)))
     order = {name: index for index, name in enumerate(first)}
     found = parameters(TrainSettings, shown)
     return sorted(found, key=lambda one: order.get(one.name or "", len(order)))
 
 
-def own_parameters(row: Estimator[Any]) -> list[click.Parameter]:
+def own_parameters(estimator: Estimator[Any]) -> list[click.Parameter]:
     """Return the options of an estimator for a command line."""
-    return parameters(row.settings, _shown(row.settings(), row.paper))
+    return parameters(estimator.settings, _shown(estimator.settings(), estimator.paper))
 
 
 def network_parameters(network: str) -> list[click.Parameter]:

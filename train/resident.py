@@ -17,9 +17,7 @@ from graspq.datasets.blocks import BlockArrays
 from graspq.datasets.episode import Int64
 from graspq.datasets.loader import READERS
 from graspq.datasets.pool import ShardPool
-from graspq.train.batch import Batch
-
-COLUMNS = ("step", "action", "reward", "terminal", "mc_return", "synthetic_action")
+from graspq.train.batch import SOURCES, Batch
 
 
 def image_bytes(pool: ShardPool) -> int:
@@ -33,7 +31,7 @@ class ResidentPool:
 
     Attributes:
         image: uint8 [N, H, W, C].
-        columns: the other columns of a batch by name, [N, ...]; see `Batch` for their types.
+        columns: the other columns of the data by name, [N, ...]; see `Batch` for their types.
         first_row: int64 [E], the first row of each episode.
         length: int64 [E], steps of each; on the CPU.
     """
@@ -70,14 +68,14 @@ class ResidentPool:
 
         records = np.concatenate([block.records for block in blocks])
         length = np.concatenate([block.lengths for block in blocks])
-        columns = {name: tensor(records[name]) for name in COLUMNS}
+        columns = {name: tensor(records[name]) for name in records.dtype.names or () if name not in SOURCES}
         return cls(image, columns, tensor(np.cumsum(length) - length), length)
 
     def transitions(self, rows: Int64, need_next: bool) -> Batch:
         """Return the transitions of rows, int64 [B], as `to_tensors` gives those of a `TransitionBatch`."""
         index = torch.from_numpy(rows).to(self.image.device)
         columns = {name: column[index].unsqueeze(1) for name, column in self.columns.items()}
-        batch = Batch(image=self.image[index].unsqueeze(1), **columns)
+        batch = Batch.of({"image": self.image[index].unsqueeze(1), **columns})
         if not need_next:
             return batch
         # A terminal row has no s': its own image stands there, and no target reads it.
@@ -95,5 +93,5 @@ class ResidentPool:
         def padded(values: Tensor) -> Tensor:
             return values[row] * mask.view(*mask.shape, *[1] * (values.dim() - 1)).to(values.dtype)
 
-        columns = {name: padded(column) for name, column in self.columns.items() if name != "step"}
-        return Batch(image=padded(self.image), step=step.contiguous(), mask=mask, **columns)
+        columns = {name: padded(column) for name, column in self.columns.items()}
+        return Batch.of({**columns, "image": padded(self.image), "step": step.contiguous(), "mask": mask})

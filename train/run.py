@@ -161,6 +161,18 @@ class Run:
         # Only a line that ends was written whole.
         return [json.loads(line) for line in lines[:-1] if line]
 
+    def summary(self) -> str:
+        """Return one line on how the training ended."""
+        rows, parts = self.metrics(), [str(self.folder)]
+        for last in [row for row in rows if "loss" in row][-1:]:
+            parts.append(f"step {last['step']}, loss {last['loss']:.4f}")
+            parts.append(f"{last['samples_per_second']:.0f} samples/s")
+        for last in [row["validation"] for row in rows if "validation" in row][-1:]:
+            parts.append(f"held-back loss {last['loss']:.4f}")
+            auc = last["roc_auc_last_step"]
+            parts += [f"ROC AUC of last steps {auc:.3f}"] if auc is not None else []
+        return "; ".join(parts)
+
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Add a row to `metrics.jsonl`."""
         with self.metrics_file.open("a") as file:

@@ -4,17 +4,14 @@ Searches are pure functions of a Q-function of actions and of random numbers tha
 choice does not depend on which other states share its batch. Dimensions: B batch, N candidates, A action, I iterations.
 """
 
-import dataclasses
-from collections.abc import Callable, Mapping
-from typing import ClassVar, NamedTuple, Protocol, cast
+from collections.abc import Callable
+from typing import NamedTuple
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from graspq.common.action_space import ActionSpace
-from graspq.train.networks.network import QNetwork
-from graspq.train.search_settings import Answer, CemSettings, StepMode
+from graspq.train.search_settings import Answer
 
 QOfActions = Callable[[Tensor], Tensor]
 """Q of candidate actions, [B, N, A] -> [B, N], for B states that are fixed inside it."""
@@ -59,21 +56,18 @@ def uniform_actions(generator: torch.Generator, batch: int, candidates: int, dim
     return draws * 2 - 1
 
 
-def uniform_search(q_of_actions: QOfActions, candidates: Tensor) -> Choice:
-    """Return the best of the given candidates.
-
-        a* = argmaxᵢ Q(s, aᵢ)
+def best_of(candidates: Tensor, q: Tensor) -> Choice:
+    """Return the candidate of highest Q in each state, the first of equals: a* = argmaxᵢ Q(s, aᵢ).
 
     Args:
-        q_of_actions: Q-function of candidates.
-        candidates: float [B, N, A] in [-1, 1]; see `uniform_actions`.
+        candidates: float [B, N, A].
+        q: theirs, float [B, N].
 
-    Returns:
-        The choice; the first of equals.
-
-    Source: Quillen et al. 2018, section "Off-Policy Q-Learning" (16 uniform actions).
+    Source: Quillen et al. 2018, section "Off-Policy Q-Learning" (the best of 16 uniform actions).
     """
-    return _best(candidates, q_of_actions(candidates))
+    index = q.argmax(dim=1)
+    rows = torch.arange(len(index), device=index.device)
+    return Choice(candidates[rows, index], q[rows, index])
 
 
 def cross_entropy_method(
@@ -115,12 +109,12 @@ def cross_entropy_method(
     start, spread, low, high = (bound.unsqueeze(1) for bound in space)
     candidates = (start + spread * noise[0]).clamp(low, high)
     q = q_of_actions(candidates)
-    best = _best(candidates, q)
+    best = best_of(candidates, q)
     for epsilon in noise[1:]:
         deviation, mean = _elite_moments(candidates, q, elites)
         candidates = (mean + deviation * epsilon).clamp(low, high)
         q = q_of_actions(candidates)
-        best = _better(best, _best(candidates, q))
+        best = _better(best, best_of(candidates, q))
     if answer == "best":
         return best
     _, mean = _elite_moments(candidates, q, elites)
@@ -150,137 +144,12 @@ def pointed(output: Tensor, action: ActionSpace) -> Tensor:
     return FARTHEST_POINT * shifted * torch.rsqrt(1 + shifted.square())
 
 
-def one_step_of(displacement: Tensor, mode: StepMode) -> Tensor:
-    """Return the first step of a displacement that may need several, as an action.
-
-        scale:  a = d / max(1, maxᵢ |dᵢ|)     a straight line, all parts arrive together
-        clip:   aᵢ = clip(dᵢ, -1, 1)          each part as fast as it may
-
-    Args:
-        displacement: d, float [B, A] in units of the action limits.
-        mode: see above.
-
-    Returns:
-        float [B, A] in [-1, 1].
-    """
-    if mode == "clip":
-        return displacement.clamp(-1, 1)
-    return displacement / displacement.abs().amax(-1, keepdim=True).clamp(min=1)
-
-
-@dataclasses.dataclass(frozen=True)
-class Acting:
-    """What a run acts with.
-
-    Attributes:
-        networks: by part, in evaluation mode.
-        kept: tensors that the estimator keeps besides.
-        action: what an action means.
-        pose_bounds: least and greatest pose that the gripper is commanded to, float [A] each, where they are known.
-    """
-
-    networks: Mapping[str, nn.Module]
-    kept: Mapping[str, Tensor]
-    action: ActionSpace
-    pose_bounds: tuple[Tensor, Tensor] | None = None
-
-    @property
-    def q(self) -> QNetwork:
-        """Q(s, a)."""
-        return cast(QNetwork, self.networks["q"])
-
-
-class ActionSelection(Protocol):
-    """How the policy of an estimator finds its action, and the paper's words for it."""
-
-    words: ClassVar[str]
-
-    def act(
-        self,
-        acting: Acting,
-        image: Tensor,
-        step: Tensor,
-        pose: Tensor | None,
-        random: np.random.Generator,
-        cem: CemSettings,
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return the action for one state, float32 [1, A] in [-1, 1], and what it is worth, float32 [1] or None.
-
-        Args:
-            acting: networks and whatever else a run acts with.
-            image: uint8 [1, H, W, C].
-            step: int64 [1], actions taken so far.
-            pose: of the gripper, float32 [1, A], where it is known; no network sees it.
-            random: all noise of the decision.
-            cem: settings of a search.
-        """
-
-
-class StochasticSearch:
-    """The cross-entropy method over the actions of one step."""
-
-    words: ClassVar[str] = "stochastic search"
-
-    def act(
-        self,
-        acting: Acting,
-        image: Tensor,
-        step: Tensor,
-        pose: Tensor | None,
-        random: np.random.Generator,
-        cem: CemSettings,
-    ) -> tuple[Tensor, Tensor | None]:
-        """Search an action; see `ActionSelection.act`."""
-        shape = (cem.iterations, 1, cem.samples, acting.action.size)
-        noise = torch.from_numpy(random.standard_normal(shape, dtype=np.float32)).to(image.device)
-        space = self.space(acting, noise, step, pose)
-        found = cross_entropy_method(acting.q.at(image, step), noise, space, elites=cem.elites, answer=cem.answer)
-        return self.executed(found.action.float(), cem).clamp(-1, 1), found.q.float()
-
-    def space(self, acting: Acting, near: Tensor, step: Tensor, pose: Tensor | None) -> SearchSpace:
-        """Return where the search starts and may go; tensors of the type and on the device of `near`."""
-        return single_steps(acting.action, near)
-
-    def executed(self, found: Tensor, cem: CemSettings) -> Tensor:
-        """Return the action, [1, A], for what the search found."""
-        return found
-
-
-class ActorNetwork:
-    """The action that the actor network points at: the mean where its policy is a distribution."""
-
-    words: ClassVar[str] = "actor network"
-
-    def act(
-        self,
-        acting: Acting,
-        image: Tensor,
-        step: Tensor,
-        pose: Tensor | None,
-        random: np.random.Generator,
-        cem: CemSettings,
-    ) -> tuple[Tensor, Tensor | None]:
-        """Ask the actor; its worth is Q(s, a) where there is a Q-function, else V(s). See `ActionSelection.act`."""
-        output = acting.networks["actor"](image, step)[:, : acting.action.size]
-        action = pointed(output, acting.action).clamp(-1, 1)
-        if "q" in acting.networks:
-            return action, acting.q.at(image, step)(action.unsqueeze(1)).squeeze(1).float()
-        value = acting.networks["v"](image, step).squeeze(-1).float() if "v" in acting.networks else None
-        return action, value
-
-
 def _elite_moments(candidates: Tensor, q: Tensor, elites: int) -> tuple[Tensor, Tensor]:
     """Return standard deviation and mean, [B, 1, A] each, of the `elites` candidates of highest Q."""
     chosen = q.topk(elites, dim=1).indices
     elite = candidates.gather(1, chosen.unsqueeze(-1).expand(-1, -1, candidates.shape[-1]))
     deviation, mean = torch.std_mean(elite, dim=1, keepdim=True)
     return deviation, mean
-
-
-def _best(candidates: Tensor, q: Tensor) -> Choice:
-    index = q.argmax(dim=1)
-    rows = torch.arange(len(index), device=index.device)
-    return Choice(candidates[rows, index], q[rows, index])
 
 
 def _better(first: Choice, second: Choice) -> Choice:

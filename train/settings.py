@@ -12,6 +12,7 @@ from typing import Any, Literal
 from graspq.common.errors import UserError
 from graspq.common.options import Settings, flag, setting
 from graspq.datasets.loader import DEFAULT_BUFFER_BYTES
+from graspq.train.device import Device
 from graspq.train.estimator import Estimator, EstimatorSettings
 from graspq.train.estimators import ESTIMATORS, estimator_named
 from graspq.train.networks import NETWORKS, network_named
@@ -44,7 +45,7 @@ class TrainSettings(Recipe):
     buffer_bytes: int = setting(
         DEFAULT_BUFFER_BYTES, help="Memory for decoded data, bytes; a dataset that fits is read once.", minimum=1
     )
-    device: Literal["auto", "cpu", "cuda"] = setting("auto", help="Where to train; auto takes a GPU if there is one.")
+    device: Device = setting("auto", help="Where to train; auto takes a GPU if there is one.")
     resident: bool = setting(False, help="Keep all images as uint8 on the device, instead of streaming them.")
     threads: int | None = setting(None, help="CPU threads of torch; its own choice where not given.", minimum=1)
     own: EstimatorSettings
@@ -61,7 +62,7 @@ class TrainSettings(Recipe):
             raise UserError("--shards: expected dataset folders, shard files or globs, got none")
 
     @property
-    def row(self) -> Estimator[Any]:
+    def estimator(self) -> Estimator[Any]:
         """The estimator."""
         return estimator_named(self.algo)
 
@@ -104,11 +105,11 @@ def complete(given: Mapping[str, Any], preset: Preset = "default") -> TrainSetti
     """
     if "algo" not in given:
         raise UserError(f"--algo: expected an estimator: {', '.join(ESTIMATORS)}, or module:row of your own")
-    row = estimator_named(given["algo"])
-    recipe = row.paper_recipe if preset == "paper" else Recipe()
+    estimator = estimator_named(given["algo"])
+    recipe = estimator.paper_recipe if preset == "paper" else Recipe()
     network = given.get("network", recipe.network)
-    own, network_own = row.paper if preset == "paper" else row.settings(), network_named(network).settings()
-    refuse_taken_names(row, network)
+    own, network_own = estimator.paper if preset == "paper" else estimator.settings(), network_named(network).settings()
+    refuse_taken_names(given["algo"], network)
     values: dict[str, Any] = {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)}
     return _changed(values | {"network": network}, {"own": own, "network_own": network_own}, given)
 
@@ -149,22 +150,24 @@ def unknown_option(option: str, algo: str, network: str) -> str:
     return f"{option} belongs to {', '.join(owners)}; it is no option of --algo {algo} with --network {network}"
 
 
-def refuse_taken_names(row: Estimator[Any], network: str) -> None:
+def refuse_taken_names(algo: str, network: str) -> None:
     """Refuse an estimator or networks whose options have a name that another option has.
 
     Raises:
         UserError: they have.
     """
-    if not isinstance(row.paper, row.settings):
-        raise UserError(f"--algo: paper: expected {row.settings.__name__}, the row has {type(row.paper).__name__}")
-    common, of_network = names_of(TrainSettings) | COMMAND_OPTIONS, network_named(network).settings
-    for option, kind in (("--algo", row.settings), (f"--network {network}", of_network)):
-        for name in sorted(names_of(kind) & common):
-            raise UserError(f"{option}: {kind.__name__}.{name} is the name of a common option; give it another")
-    for name in sorted(names_of(row.settings) & names_of(of_network)):
-        raise UserError(
-            f"--algo: {row.settings.__name__}.{name} is the name of an option of --network {network}; give it another"
-        )
+    estimator, of_network = estimator_named(algo), network_named(network).settings
+    own, paper = estimator.settings, type(estimator.paper)
+    if not issubclass(paper, own):
+        raise UserError(f"--algo {algo}: paper: expected {own.__name__}, got {paper.__name__}")
+    of_command, of_networks = names_of(TrainSettings) | COMMAND_OPTIONS, names_of(of_network)
+    for option, kind, taken, owner in (
+        (f"--algo {algo}", own, of_command, "a common option"),
+        (f"--network {network}", of_network, of_command, "a common option"),
+        (f"--algo {algo}", own, of_networks, f"an option of --network {network}"),
+    ):
+        for name in sorted(names_of(kind) & taken):
+            raise UserError(f"{option}: {kind.__name__}.{name} is the name of {owner}; give it another")
 
 
 def names_of(kind: type[Settings]) -> set[str]:

@@ -7,6 +7,8 @@ episode from its first to its last step; a batch of single transitions is T = 1.
 import torch
 from torch import Tensor
 
+from graspq.train.selection import QOfActions, best_of
+
 
 def discounted_return(reward: Tensor, discount: float, mask: Tensor | None = None) -> Tensor:
     """Return the discounted sum of the rewards from each step to the last one.
@@ -24,13 +26,13 @@ def discounted_return(reward: Tensor, discount: float, mask: Tensor | None = Non
     Source: Quillen et al. 2018, section "Regression with Monte Carlo Return Estimates".
     """
     _check_shapes(reward, mask)
-    kept = reward if mask is None else torch.where(mask, reward, torch.zeros_like(reward))
+    kept = _real(reward, mask)
     result = torch.zeros_like(kept)
     following = torch.zeros_like(kept[:, 0])
     for t in reversed(range(kept.shape[1])):
         following = kept[:, t] + discount * following
         result[:, t] = following
-    return result if mask is None else torch.where(mask, result, torch.zeros_like(result))
+    return _real(result, mask)
 
 
 def episode_value(observed_return: Tensor) -> Tensor:
@@ -48,6 +50,79 @@ def episode_value(observed_return: Tensor) -> Tensor:
     "Summary and Unified View". Its footnote says that Monte Carlo and supervised learning use no discount.
     """
     return observed_return
+
+
+def bootstrapped(reward: Tensor, terminal: Tensor, next_value: Tensor, discount: float) -> Tensor:
+    """Return the Bellman target.
+
+        y_t = r_t + γ V(s_{t+1})  before the last step,  y_T = r_T  at it
+
+    With double Q-learning V is that of `double_q`.
+
+    Args:
+        reward: float [B, T].
+        terminal: bool [B, T], true at the last step of an episode, where `next_value` is not read (it may be NaN).
+        next_value: V(s_{t+1}), float [B, T].
+        discount: γ in [0, 1].
+
+    Returns:
+        float [B, T].
+
+    Source: Quillen et al. 2018, section "Off-Policy Q-Learning".
+    """
+    _check_shapes(reward, terminal, next_value)
+    return reward + discount * torch.where(terminal, torch.zeros_like(next_value), next_value)
+
+
+def double_q(q: Tensor, candidates: Tensor, judge: QOfActions, beside: Tensor | None = None) -> Tensor:
+    """Return V(s) of double Q-learning: θ picks the best candidate, the lagged θ' judges it.
+
+        V(s) = Q_θ'(s, argmax_{a ∈ {a₁ .. a_N}} Q_θ(s, a))
+
+    Args:
+        q: Q_θ of the candidates, float [B, N]; B are the states.
+        candidates: float [B, N, A].
+        judge: Q_θ' of actions; asked once.
+        beside: further actions that θ' judges, float [B, M, A].
+
+    Returns:
+        float [B, M + 1]: Q_θ' of the M actions, then V(s).
+
+    Source: van Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning", equation 4, over candidates;
+    Quillen et al. 2018, section "Off-Policy Q-Learning" (16 uniform ones).
+    """
+    picked = best_of(candidates, q).action.unsqueeze(1)
+    return judge(picked if beside is None else torch.cat([beside, picked], dim=1))
+
+
+def n_step(
+    reward: Tensor, value: Tensor, discount: float, steps: int | None = None, mask: Tensor | None = None
+) -> Tensor:
+    """Return the rewards of the next n steps and the value of the state after them.
+
+        y_t = Σ_{i=0}^{n-1} γⁱ r_{t+i} + γⁿ V(s_{t+n}),  V = r = 0 after the end
+
+    With n = 1 this is the bootstrapped target, with n ≥ T the observed return.
+
+    Args:
+        reward: float [B, T], whole episodes.
+        value: V(s_t), float [B, T]; that of the first step is not read (it may be NaN).
+        discount: γ in [0, 1].
+        steps: n, at least 1; None is the rest of the episode.
+        mask: bool [B, T], false where an episode has already ended; nothing is read there and the result is 0.
+
+    Returns:
+        float [B, T].
+
+    Source: Sutton and Barto 2018, equation 7.1; none in Quillen et al. 2018.
+    """
+    _check_shapes(reward, value, mask)
+    to_the_end = discounted_return(reward, discount, mask)
+    if steps is None or steps >= reward.shape[1]:
+        return to_the_end
+    after = torch.zeros_like(to_the_end)
+    after[:, :-steps] = (_real(value, mask) - to_the_end)[:, steps:]
+    return _real(to_the_end + discount**steps * after, mask)
 
 
 def corrected_episode_value(
@@ -96,8 +171,8 @@ def path_consistent(
         y_t = γᵈ V(s_{t+d}) + Σ_{i=0}^{d-1} γⁱ (r_{t+i} - λ ρ_{t+i}),  ρ = log π(a|s) - log π'(a|s),
         V = r = ρ = 0 after the end
 
-    The corrected episode value with λ ρ for the advantage, which also counts at the first step: V is wanted here, not
-    Q. Gradients flow through `value` and `log_ratio`.
+    The n-step target of rewards less λ ρ: the corrected episode value with λ ρ for the advantage, which also counts at
+    the first step, for V is wanted here, not Q. Gradients flow through `value` and `log_ratio`.
 
     Args:
         reward: float [B, T], whole episodes.
@@ -113,37 +188,8 @@ def path_consistent(
 
     Source: Quillen et al. 2018, section "Path Consistency Learning"; Nachum et al. 2018, "Trust-PCL", equation 15.
     """
-    _check_shapes(reward, value, log_ratio, mask)
-    to_the_end = discounted_return(reward - penalty * log_ratio, discount, mask)
-    if path_steps is None or path_steps >= reward.shape[1]:
-        return to_the_end
-    kept = value if mask is None else torch.where(mask, value, torch.zeros_like(value))
-    after = torch.zeros_like(kept)
-    after[:, :-path_steps] = (kept - to_the_end)[:, path_steps:]
-    result = to_the_end + discount**path_steps * after
-    return result if mask is None else torch.where(mask, result, torch.zeros_like(result))
-
-
-def bootstrapped(reward: Tensor, terminal: Tensor, next_value: Tensor, discount: float) -> Tensor:
-    """Return the Bellman target.
-
-        y_t = r_t + γ V(s_{t+1})  before the last step,  y_T = r_T  at it
-
-    With double Q-learning V(s') = Q_θ'(s', argmax_a' Q_θ(s', a')): θ picks, the lagged θ' judges.
-
-    Args:
-        reward: float [B, T].
-        terminal: bool [B, T], true at the last step of an episode, where `next_value` is not read (it may be NaN).
-        next_value: V(s_{t+1}), float [B, T].
-        discount: γ in [0, 1].
-
-    Returns:
-        float [B, T].
-
-    Source: Quillen et al. 2018, section "Off-Policy Q-Learning".
-    """
-    _check_shapes(reward, terminal, next_value)
-    return reward + discount * torch.where(terminal, torch.zeros_like(next_value), next_value)
+    _check_shapes(reward, log_ratio)
+    return n_step(reward - penalty * log_ratio, value, discount, path_steps, mask)
 
 
 def blended(
@@ -153,7 +199,8 @@ def blended(
 
         y_t = r_t + γ [(1 - λ_{t+1}) V(s_{t+1}) + λ_{t+1} (y_{t+1} - A(s_{t+1}, a_{t+1}))],  y_T = r_T
 
-    With λ = 0 this is the bootstrapped target, with λ = 1 the corrected episode value with ν = 1.
+    With λ = 0 this is the bootstrapped target, with λ = 1 the corrected episode value with ν = 1; with A = 0 and one λ
+    for all it is the return of TD(λ), between the bootstrapped target and the observed return.
 
     Args:
         reward: float [B, T], whole episodes.
@@ -174,10 +221,15 @@ def blended(
     following = torch.zeros_like(reward[:, 0])
     for t in reversed(range(reward.shape[1])):
         y = reward[:, t] + discount * following
-        result[:, t] = torch.where(real[:, t], y, torch.zeros_like(y))
+        result[:, t] = y
         mixed = (1 - weight[:, t]) * value[:, t] + weight[:, t] * (y - advantage[:, t])
         following = torch.where(real[:, t], mixed, torch.zeros_like(mixed))
-    return result
+    return _real(result, mask)
+
+
+def _real(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Return values, [B, T], with 0 on padding whatever stands there."""
+    return values if mask is None else torch.where(mask, values, torch.zeros_like(values))
 
 
 def _check_shapes(reference: Tensor, *others: Tensor | None) -> None:

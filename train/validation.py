@@ -51,7 +51,7 @@ class Validation:
 @torch.no_grad()
 def validate(
     batches: Iterable[Batch],
-    row: Estimator[S],
+    estimator: Estimator[S],
     networks: Networks,
     settings: S,
     random: torch.Generator,
@@ -61,7 +61,7 @@ def validate(
 
     Args:
         batches: held back from training.
-        row: the estimator.
+        estimator: whose target they have.
         networks: to be judged.
         settings: of the estimator.
         random: random numbers of the targets.
@@ -73,14 +73,14 @@ def validate(
     scores, rewards = [], []
     for batch in batches:
         size = int(batch.real_steps)
-        total += float(row.objective(row, batch, networks, settings, random, progress)) * size
+        total += float(estimator.objective(estimator, batch, networks, settings, random, progress)) * size
         count += size
         last = batch.real(batch.terminal)
         last_steps += int(last.sum())
-        if "q" in row.parts:
+        if "q" in estimator.parts:
             with networks.autocast():
                 q_at_last = networks.q.at(batch.real(batch.image)[last], batch.real(batch.step)[last])
-                score = q_at_last(batch.real(row.action(batch))[last].unsqueeze(1)).squeeze(1)
+                score = q_at_last(batch.real(estimator.regressed_action(batch))[last].unsqueeze(1)).squeeze(1)
             scores.append(score.float().cpu().numpy())
             rewards.append(batch.real(batch.reward)[last].cpu().numpy())
     if count == 0:

@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import refuse_other
 from graspq.common.files import writable_folder
 from graspq.common.provenance import versions
 from graspq.common.seeding import integer_seed
@@ -21,7 +20,7 @@ from graspq.datagen.shards import check_disk
 from graspq.datasets.blocks import BlockRef
 from graspq.datasets.card import write_card
 from graspq.datasets.dataset import open_shards
-from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, steps_file
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, require_same, steps_file
 from graspq.datasets.pool import ShardPool
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 from graspq.objects.object_set import ObjectSet
@@ -30,7 +29,6 @@ from graspq.sim.task import Task
 from graspq.studies.online.resolve import Plan
 
 DATASET = "dataset"
-DECIDING = ("task", "settings", "versions", "object_set", "discount")
 
 
 def collection_settings(plan: Plan) -> CollectionSettings:
@@ -96,8 +94,7 @@ class GrowingDataset:
         )
         remove_leftovers(folder)
         growing = cls(folder, Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else fresh, plan)
-        theirs, ours = ({name: getattr(one, name) for name in DECIDING} for one in (growing.manifest, fresh))
-        refuse_other(folder, "grasps made", theirs, ours, "choose another run folder with --out")
+        require_same(folder, growing.manifest, fresh, "choose another run folder with --out")
         check_disk(folder, plan.online.rounds * plan.online.grasps - growing.manifest.episodes)
         objects.copy_to(folder / "objects")
         growing.manifest.save(folder)

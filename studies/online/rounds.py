@@ -23,8 +23,9 @@ from graspq.sim.task import Task, task_from_json
 from graspq.studies.online.growth import GrowingDataset
 from graspq.studies.online.pools import PoolOfRounds
 from graspq.studies.online.resolve import Plan
-from graspq.train.loop import Session, session
+from graspq.train.loop import train_until
 from graspq.train.run import Run
+from graspq.train.session import Session, session
 
 
 def run_online(plan: Plan, *, show_progress: bool = False) -> Run:
@@ -92,7 +93,7 @@ class _Round:
 
     def train(self) -> None:
         pool = self.pools.of(self.growing.blocks_of(self.number + 1))
-        self.current.steps(pool, self.plan.border(self.number + 1), self.show_progress)
+        train_until(self.plan.border(self.number + 1), self.current, pool, self.show_progress)
 
     def collected(self) -> bool:
         """Return whether the row of metrics is there, which is written after the grasps."""

@@ -12,10 +12,10 @@ from graspq.evaluate.rollout import Rollouts
 from graspq.evaluate.scenes import Scenes
 from graspq.policies.of_run import Origin, RunPolicy
 from graspq.sim.task import task_named
+from graspq.train.acting import Acting, ActorNetwork, StochasticSearch
 from graspq.train.networks import build, q_network, state_network
 from graspq.train.networks.network import NetworkSpecification
 from graspq.train.search_settings import CemSettings
-from graspq.train.selection import Acting, ActorNetwork, StochasticSearch
 from graspq.train.state import seeded
 
 TASK = task_named("regular")

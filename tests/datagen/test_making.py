@@ -126,7 +126,7 @@ def test_nonsense_is_one_line_and_status_two_and_writes_nothing(tmp_path, argume
 def test_other_settings_or_a_foreign_folder_are_refused_and_nothing_is_lost(finished, tmp_path, objects):
     before = digests(finished)
     done = run("--size", "130", "--seed", "4", "--out", finished, "--objects", objects, expect=2)
-    assert "another settings (seed): 3 there, 4 asked for" in done.stderr
+    assert "holds grasps made with settings.seed = 3, not 4" in done.stderr
     assert digests(finished) == before
     (tmp_path / "notes.txt").write_text("mine")
     done = run("--out", tmp_path, expect=2)

@@ -23,7 +23,7 @@ def test_a_pool_names_every_block_with_its_rows_and_episodes(dataset, drawn):
     assert blocks_of(pool) == list(range(12))
     assert [ref.rows for ref in pool.blocks] == [sum(e.steps for e in drawn.episodes(b, 1)) for b in range(12)]
     assert (pool.episodes, pool.max_steps, pool.discount) == (24, 15, 1.0)
-    assert pool.action_limits == drawn.limits
+    assert pool.action.limits == drawn.limits
     assert pool.manifest_digest == Manifest.load(dataset).digest()
 
 
@@ -150,7 +150,7 @@ def test_names_that_are_no_shards_give_one_line(dataset, tmp_path):
         with pytest.raises(UserError, match=message) as caught:
             open_shards([name])
         assert "\n" not in caught.value.message
-    with pytest.raises(UserError, match="--shards: expected"):
+    with pytest.raises(UserError, match=r"^shards: expected"):
         open_shards([])
 
 
@@ -217,5 +217,5 @@ def test_each_side_gets_a_block_where_there_are_two(new_dataset):
 
 @pytest.mark.parametrize("fraction", [-0.1, 1.0, float("nan")])
 def test_a_fraction_outside_its_range_is_refused(dataset, fraction):
-    with pytest.raises(UserError, match="--validation-fraction"):
+    with pytest.raises(UserError, match=r"^fraction: expected a number in \[0, 1\)"):
         open_shards([dataset]).split(fraction, 0)

@@ -118,7 +118,7 @@ def test_a_buffer_too_small_to_mix_blocks_names_what_is_enough():
 
 @pytest.mark.parametrize("batch_size", [0, -1, 10**6])
 def test_a_batch_larger_than_the_data_or_empty_is_refused(batch_size):
-    with pytest.raises(UserError, match="--batch-size: expected 1 to"):
+    with pytest.raises(UserError, match=r"^batch_size: expected 1 to"):
         Sampler(ROWS, batch_size, 0, 10**9)
 
 

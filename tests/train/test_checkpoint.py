@@ -23,8 +23,8 @@ Make = Callable[..., TrainSettings]
 
 
 def fresh_state(specification: NetworkSpecification, settings: TrainSettings) -> TrainState:
-    lagged = hasattr(settings.own, "lag_steps")
-    return new_state(specification, settings.row.parts, settings, settings.seed, FLOAT32, lagged=lagged)
+    lagged = settings.own.lag is not None
+    return new_state(specification, settings.estimator.parts, settings, settings.seed, FLOAT32, lagged=lagged)
 
 
 @pytest.fixture

@@ -14,11 +14,12 @@ from graspq.common.errors import UserError
 from graspq.datasets.dataset import open_shards
 from graspq.train.batch import Batch
 from graspq.train.batches import training_batches
-from graspq.train.estimator import as_markdown, cross_entropy, squared
-from graspq.train.estimators import ESTIMATORS, dql, estimator_named, mc
-from graspq.train.loop import session
+from graspq.train.estimator import cross_entropy, squared
+from graspq.train.estimators import ESTIMATORS, as_markdown, dql, estimator_named, mc
+from graspq.train.loop import update
 from graspq.train.networks.network import Features, QNetwork
 from graspq.train.selection import uniform_actions
+from graspq.train.session import session
 from graspq.train.settings import TrainSettings
 from graspq.train.state import seeded
 
@@ -76,7 +77,7 @@ def test_the_monte_carlo_target_is_the_observed_return() -> None:
 
 
 def test_the_table_has_the_papers_words() -> None:
-    assert as_markdown(ESTIMATORS).splitlines()[:8] == [
+    assert as_markdown().splitlines()[:8] == [
         "| `--algo` | target value | action selection |",
         "|---|---|---|",
         "| `supervised` | episode value, on synthetic actions | stochastic search |",
@@ -176,11 +177,10 @@ def test_target_search_and_evaluation_passes_never_use_batch_statistics(
     pool = open_shards(chosen.shards)
     training, held_back = pool.split(chosen.validation_fraction, chosen.seed)
     with session(chosen, pool, training, held_back) as current:
-        data, wanted = training.with_discount(chosen.own.chosen_discount(1.0)), chosen.row.target_value
         passes = watch(current.state.named_networks)
-        with training_batches(data, chosen, wanted, torch.device("cpu"), 0) as batches:
+        with training_batches(training, chosen, torch.device("cpu"), 0) as batches:
             for batch in itertools.islice(batches, 2):
-                current.update(batch)
+                update(current, batch)
                 assert sorted(passes) == PASSES[algo]
                 passes.clear()
         assert current.validate() is not None

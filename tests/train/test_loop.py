@@ -18,11 +18,15 @@ import torch
 from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
 from graspq.train import loop
+from graspq.train.acting import Acting, ObservedState
+from graspq.train.batch import Batch
 from graspq.train.checkpoint import load_acting
+from graspq.train.estimator import Metrics
 from graspq.train.estimators import ESTIMATORS
-from graspq.train.loop import DivergedError, train
+from graspq.train.loop import train
 from graspq.train.run import Run
-from graspq.train.selection import Acting, CemSettings
+from graspq.train.search_settings import CemSettings
+from graspq.train.session import DivergedError, Session
 from graspq.train.settings import TrainSettings
 
 Make = Callable[..., TrainSettings]
@@ -165,22 +169,20 @@ def test_divergence_stops_with_estimator_step_quantity_and_the_last_good_checkpo
     assert message.startswith("mc diverged at step ") and "is not finite" in message and "\n" not in message
 
 
-def test_the_step_of_a_loss_that_is_not_finite_is_named_and_the_checkpoint_before_it_kept(settings: Make) -> None:
+def test_the_step_of_a_loss_that_is_not_finite_is_named_and_the_checkpoint_before_it_kept(
+    settings: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     chosen = settings(steps=30, save_every=3)
     run = train(chosen, stop_at=3)
 
-    class Poisoned(loop.Session):
-        def update(self, batch: loop.Batch) -> loop.Metrics:
-            metrics = super().update(batch)
-            return metrics | {"loss": metrics["loss"] * torch.nan} if self.state.step == 5 else metrics
+    def poisoned(current: Session, batch: Batch) -> Metrics:
+        metrics = original(current, batch)
+        return metrics | {"loss": metrics["loss"] * torch.nan} if current.state.step == 5 else metrics
 
-    original = loop.Session
-    loop.Session = Poisoned  # type: ignore[misc]
-    try:
-        with pytest.raises(DivergedError, match=r"mc diverged at step 5: the loss is not finite; .*step-00000003 is"):
-            train(chosen)
-    finally:
-        loop.Session = original  # type: ignore[misc]
+    original = loop.update
+    monkeypatch.setattr(loop, "update", poisoned)
+    with pytest.raises(DivergedError, match=r"mc diverged at step 5: the loss is not finite; .*step-00000003 is"):
+        train(chosen)
     assert run.latest_checkpoint() == run.folder / "checkpoints/step-00000003"
 
 
@@ -271,6 +273,6 @@ def test_actions_of_five_parts_without_a_mirror_plane_train_every_row_and_act(
     bounds = torch.full((5,), -1.0), torch.full((5,), 1.0)
     acting = Acting(loaded.networks, loaded.kept, loaded.specification.action, bounds)
     image, step = torch.zeros(1, 16, 16, 3, dtype=torch.uint8), torch.zeros(1, dtype=torch.int64)
-    pose, random = torch.zeros(1, 5), np.random.default_rng(0)
-    action, _ = ESTIMATORS[algo].action_selection.act(acting, image, step, pose, random, CemSettings())
+    state, random = ObservedState(image, step, pose=torch.zeros(1, 5)), np.random.default_rng(0)
+    action, _ = ESTIMATORS[algo].action_selection.act(acting, state, random, CemSettings())
     assert action.shape == (1, 5) and float(action.abs().max()) <= 1

@@ -79,7 +79,7 @@ import torch
 from torch import nn
 from graspq.common.options import setting
 from graspq.train.estimator import Loss, RegressionSettings, TargetValue, loss_of, squared, targets_of
-from graspq.train.estimators.mc import ROW
+from graspq.train.estimators.mc import row
 from graspq.train.networks.network import QNetwork
 
 @dataclasses.dataclass(frozen=True)
@@ -114,11 +114,12 @@ def doubled(output, target):
 class Still:
     words = "no motion"
 
-    def act(self, acting, image, step, pose, random, cem):
-        return torch.zeros(1, acting.action.size), acting.q.at(image, step)(torch.zeros(1, 1, acting.action.size))[:, 0]
+    def act(self, acting, state, random, cem):
+        still = torch.zeros(1, acting.action.size)
+        return still, acting.q.at(state.image, state.step)(still.unsqueeze(1)).squeeze(1)
 
 row = dataclasses.replace(
-    ROW, summary="Part of the return", settings=Settings, paper=Settings(loss="squared", part=0.25),
+    row, summary="Part of the return", settings=Settings, paper=Settings(loss="squared", part=0.25),
     target_value=TargetValue("part of the episode value", target), action_selection=Still(),
     loss=lambda settings: Loss("identity", doubled), parts={"q": Network}, update=update)
 wrong = "mc"
@@ -177,7 +178,7 @@ def test_an_option_of_an_estimator_may_not_take_a_common_name(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     monkeypatch.setitem(ESTIMATORS, "mine", named_like(name))
-    message = f"--algo: Settings.{name} is the name of a common option; give it another"
+    message = f"--algo mine: Settings.{name} is the name of a common option; give it another"
     with pytest.raises(UserError, match=re.escape(message)):
         complete({"algo": "mine", "shards": ("data",)})
     done = grasp_train(capsys, "--algo", "mine", "--shards", "data", "--seed", "1")

@@ -7,11 +7,10 @@ from torch import Tensor
 
 from graspq.train.selection import (
     SearchSpace,
+    best_of,
     cross_entropy_method,
-    one_step_of,
     single_steps,
     uniform_actions,
-    uniform_search,
 )
 from graspq.train.state import seeded
 
@@ -100,11 +99,11 @@ def test_the_choice_of_a_state_does_not_depend_on_the_others_in_its_batch() -> N
     assert torch.equal(both.action[1:], alone.action)
 
 
-def test_uniform_search_returns_the_best_candidate_and_its_q() -> None:
+def test_the_best_of_uniform_candidates_comes_with_its_q() -> None:
     candidates = uniform_actions(seeded("tests/uniform"), batch=2, candidates=500, dimensions=4)
     assert candidates.shape == (2, 500, 4)
     assert -1 <= float(candidates.min()) < -0.99 and 0.99 < float(candidates.max()) <= 1
-    choice = uniform_search(quadratic, candidates)
+    choice = best_of(candidates, quadratic(candidates))
     assert torch.equal(choice.q, quadratic(candidates).amax(1))
     assert torch.equal(quadratic(choice.action.unsqueeze(1)).squeeze(1), choice.q)
 
@@ -124,13 +123,6 @@ def test_the_search_stays_in_the_box_it_is_given_and_starts_where_it_says() -> N
     assert float(seen[0][1, :, 1:].std(0).amax()) < 0.02
     torch.testing.assert_close(seen[0][1].mean(0), torch.tensor([2.25, 3, 3, 3]), rtol=0, atol=0.01)
     torch.testing.assert_close(choice.action[0], torch.tensor([2.2, 1, -4, 0]), rtol=0, atol=0.2)
-
-
-def test_a_step_of_a_motion_is_scaled_along_its_line_or_clipped_and_a_short_motion_is_one_step() -> None:
-    motion = torch.tensor([[1.0, -2.0, -4.0, 0.5], [0.1, 0.0, -0.9, 1.0]])
-    scaled, clipped = one_step_of(motion, "scale"), one_step_of(motion, "clip")
-    assert torch.equal(scaled, torch.tensor([[0.25, -0.5, -1.0, 0.125], [0.1, 0.0, -0.9, 1.0]]))
-    assert torch.equal(clipped, torch.tensor([[1.0, -1.0, -1.0, 0.5], [0.1, 0.0, -0.9, 1.0]]))
 
 
 @pytest.mark.parametrize("elites", [1, 65])

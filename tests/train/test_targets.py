@@ -5,7 +5,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspq.train.targets import bootstrapped, corrected_episode_value, discounted_return, episode_value
+from graspq.train.targets import (
+    blended,
+    bootstrapped,
+    corrected_episode_value,
+    discounted_return,
+    double_q,
+    episode_value,
+    n_step,
+)
 
 REWARD = torch.tensor([[0.0, 0.0, 1.0], [0.5, -1.0, 2.0]], dtype=torch.float64)
 LAST = torch.tensor([[False, False, True], [False, False, True]])
@@ -83,6 +91,66 @@ def test_corrected_equals_bootstrapped_when_q_is_bellman_consistent_along_the_pa
     torch.testing.assert_close(corrected[path["mask"]], q[path["mask"]], rtol=0, atol=1e-12)
 
 
+@given(paths(), discounts, st.integers(1, 7))
+def test_the_n_step_target_is_its_explicit_sum_with_nothing_after_the_end(
+    path: dict[str, torch.Tensor], discount: float, steps: int
+) -> None:
+    reward, mask = path["reward"], path["mask"]
+    value = torch.cat([torch.full_like(reward[:, :1], torch.nan), path["value"][:, 1:]], dim=1)
+    result = n_step(reward, value, discount, steps, mask)
+    assert torch.equal(result[~mask], torch.zeros_like(result[~mask]))
+    for row, length in enumerate(mask.sum(1).tolist()):
+        for t in range(length):
+            end = min(t + steps, length)
+            explicit = sum(discount ** (k - t) * float(reward[row, k]) for k in range(t, end))
+            explicit += discount**steps * float(value[row, end]) if t + steps < length else 0.0
+            assert result[row, t].item() == pytest.approx(explicit, abs=1e-12)
+
+
+@given(paths(), discounts)
+def test_n_step_is_bootstrapped_at_one_and_the_episode_value_from_the_horizon_on(
+    path: dict[str, torch.Tensor], discount: float
+) -> None:
+    reward, value, mask = path["reward"], path["value"], path["mask"]
+    once = bootstrapped(reward, path["last"], next_values(value), discount)
+    torch.testing.assert_close(n_step(reward, value, discount, 1, mask)[mask], once[mask], rtol=0, atol=1e-12)
+    returns = episode_value(discounted_return(reward, discount, mask))
+    for steps in (None, reward.shape[1], 9):
+        assert torch.equal(n_step(reward, value, discount, steps, mask), returns)
+
+
+@given(paths(), discounts)
+def test_blended_without_advantages_is_td_lambda_from_bootstrapped_at_zero_to_the_episode_value_at_one(
+    path: dict[str, torch.Tensor], discount: float
+) -> None:
+    reward, value, mask, nothing = path["reward"], path["value"], path["mask"], torch.zeros_like(path["q"])
+    ends = [bootstrapped(reward, path["last"], next_values(value), discount), discounted_return(reward, discount, mask)]
+    for weight, expected in zip((0.0, 1.0), ends, strict=True):
+        result = blended(reward, value, nothing, torch.full_like(reward, weight), discount, mask)
+        torch.testing.assert_close(result[mask], expected[mask], rtol=0, atol=1e-12)
+    # λ = 1/2: Σ_n (1 - λ) λ^{n-1} n-step, and what is left of the weights on the return.
+    longest = reward.shape[1]
+    mean = sum(0.5**n * n_step(reward, value, discount, n, mask) for n in range(1, longest))
+    mean = mean + 0.5 ** (longest - 1) * discounted_return(reward, discount, mask)
+    result = blended(reward, value, nothing, torch.full_like(reward, 0.5), discount, mask)
+    torch.testing.assert_close(result, mean, rtol=0, atol=1e-12)
+
+
+def test_in_double_q_one_network_picks_the_best_candidate_and_the_other_judges_it_and_what_is_beside() -> None:
+    candidates = torch.tensor([[[1.0], [2.0], [3.0]], [[4.0], [5.0], [6.0]]])
+    q = torch.tensor([[0.0, 2.0, 2.0], [7.0, 0.0, -1.0]])
+    beside = torch.tensor([[[8.0]], [[9.0]]])
+    asked: list[torch.Tensor] = []
+
+    def judge(action: torch.Tensor) -> torch.Tensor:
+        asked.append(action)
+        return -10 * action.squeeze(-1)
+
+    assert double_q(q, candidates, judge).tolist() == [[-20.0], [-40.0]], "the first of equals"
+    assert double_q(q, candidates, judge, beside).tolist() == [[-80.0, -20.0], [-90.0, -40.0]]
+    assert [list(action.shape) for action in asked] == [[2, 1, 1], [2, 2, 1]]
+
+
 @given(paths())
 def test_one_step_of_the_corrected_recursion_is_a_bootstrap_from_the_corrected_value(
     path: dict[str, torch.Tensor],
@@ -106,6 +174,8 @@ def test_all_targets_are_the_reward_at_discount_zero() -> None:
     assert torch.equal(bootstrapped(REWARD, LAST, values, 0.0), REWARD)
     assert torch.equal(corrected_episode_value(REWARD, -values, 1.0, 0.0), REWARD)
     assert torch.equal(episode_value(discounted_return(REWARD, 0.0)), REWARD)
+    assert torch.equal(n_step(REWARD, values, 0.0, 2), REWARD)
+    assert torch.equal(blended(REWARD, values, -values, values / 7, 0.0), REWARD)
 
 
 def test_all_targets_are_the_reward_at_the_last_step() -> None:

@@ -136,7 +136,7 @@ class Data:
         here, there = (pictures()[self.place[episode, now]].unsqueeze(1) for now in (step, after))
         return Batch(image=here, next_image=there, next_step=after.unsqueeze(1), **columns)
 
-    # What an estimator's `extra` reads of a `ShardPool`, as one block.
+    # What `kept` of an estimator reads of a `ShardPool`, as one block.
     blocks = (0,)
 
     @property

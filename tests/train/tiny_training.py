@@ -96,8 +96,8 @@ def fit(row: Estimator[Any], data: Data, settings: TrainSettings) -> TrainState:
     """
     action = grasping((0.06, 0.06, 0.06, 0.4))
     specification = NetworkSpecification("tiny", (SIZE, SIZE, 3), action, STEPS, row.loss(settings.own).link)
-    precision, lag_steps = Precision("float32", torch.device("cpu")), getattr(settings.own, "lag_steps", None)
-    state = new_state(specification, row.parts, settings, settings.seed, precision, lagged=lag_steps is not None)
+    precision, lag = Precision("float32", torch.device("cpu")), settings.own.lag
+    state = new_state(specification, row.parts, settings, settings.seed, precision, lagged=lag is not None)
     state.networks.kept.update(row.kept(data, settings.own))  # type: ignore[arg-type]
     while state.step < settings.steps:
         generator = seeded("tests/tiny", settings.seed, state.step)
@@ -109,7 +109,7 @@ def fit(row: Estimator[Any], data: Data, settings: TrainSettings) -> TrainState:
         for part in state.optimizers:
             state.set_rate(part, learning_rate(settings, state.step))
         row.update(row, state, batch, settings.own, generator, state.step / settings.steps)
-        advance(state, settings.average_decay, lag_steps)
+        advance(state, settings.average_decay, lag)
     return state
 
 

@@ -8,17 +8,18 @@ that falls to 0. 3. Policies use a moving average of the weights. 4. The network
 from typing import Any
 
 from graspq.common.named_objects import named_row
+from graspq.common.text import markdown
 from graspq.train.estimator import Estimator
 from graspq.train.estimators import blend, corr_mc, ddpg, dql, mc, pcl, supervised
 
 ESTIMATORS: dict[str, Estimator[Any]] = {
-    "supervised": supervised.ROW,
-    "dql": dql.ROW,
-    "mc": mc.ROW,
-    "corr-mc": corr_mc.ROW,
-    "ddpg": ddpg.ROW,
-    "pcl": pcl.ROW,
-    "blend": blend.ROW,
+    "supervised": supervised.row,
+    "dql": dql.row,
+    "mc": mc.row,
+    "corr-mc": corr_mc.row,
+    "ddpg": ddpg.row,
+    "pcl": pcl.row,
+    "blend": blend.row,
 }
 
 
@@ -29,3 +30,9 @@ def estimator_named(name: str) -> Estimator[Any]:
         UserError: there is none of that name, or what is there is no row.
     """
     return named_row("--algo", name, ESTIMATORS, Estimator, "row")
+
+
+def as_markdown() -> str:
+    """Return the table in Markdown, as the README shows it."""
+    cells = ((f"`{name}`", row.target_value.words, row.action_selection.words) for name, row in ESTIMATORS.items())
+    return markdown(("`--algo`", "target value", "action selection"), cells)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import StochasticSearch
+from graspq.train.advantages import CorrectionSettings, LaggedValues, advantages, lagged_values
 from graspq.train.batch import Batch
-from graspq.train.estimator import Estimator, Metrics, TargetValue, loss_of
-from graspq.train.estimators.corr_mc import CorrectionSettings, Judged, advantages, judged, later_steps
-from graspq.train.selection import StochasticSearch
+from graspq.train.estimator import Estimator, Metrics, TargetValue, step_towards
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import blended, corrected_episode_value
 
@@ -78,19 +78,21 @@ def target(
     batch: Batch, networks: Networks, settings: BlendSettings, random: torch.Generator, progress: float
 ) -> Tensor:
     """Return the targets with λ as it was measured so far; float [B, T]. See `targets.blended`."""
-    seen = judged(batch, networks, settings, random)
-    return _target(batch, networks, settings, seen, advantages(batch, seen, 1.0, settings))
+    values = lagged_values(batch, networks, settings, random)
+    return _target(batch, networks, settings, values, advantages(batch, values, 1.0, settings))
 
 
-def _target(batch: Batch, networks: Networks, settings: BlendSettings, seen: Judged, advantage: Tensor) -> Tensor:
-    later = later_steps(batch)
+def _target(
+    batch: Batch, networks: Networks, settings: BlendSettings, values: LaggedValues, advantage: Tensor
+) -> Tensor:
+    later = batch.later_steps
     weight = torch.zeros_like(batch.reward)
-    weight[later] = weights(networks.kept).to(weight.dtype)[cell_of(batch.step[later], seen.q[later])]
-    return blended(batch.reward, seen.value, advantage, weight, settings.discount, batch.mask)
+    weight[later] = weights(networks.kept).to(weight.dtype)[cell_of(batch.step[later], values.q[later])]
+    return blended(batch.reward, values.value, advantage, weight, settings.discount, batch.mask)
 
 
 def measured_regression(
-    row: Estimator[BlendSettings],
+    estimator: Estimator[BlendSettings],
     state: TrainState,
     batch: Batch,
     settings: BlendSettings,
@@ -101,25 +103,25 @@ def measured_regression(
     networks = state.networks
     networks.q.eval()
     with torch.no_grad(), networks.autocast():
-        seen = judged(batch, networks, settings, random)
-        advantage = advantages(batch, seen, 1.0, settings)
-        later = later_steps(batch)
+        values = lagged_values(batch, networks, settings, random)
+        advantage = advantages(batch, values, 1.0, settings)
+        later = batch.later_steps
         corrected = corrected_episode_value(batch.reward, advantage, 1.0, settings.discount, batch.mask)
         errors = networks.kept["blend_errors"]
         errors.mul_(DECAY)
-        errors.add_(summed(cell_of(batch.step[later], seen.q[later]), (corrected - seen.q)[later], errors.shape[1]))
-        wanted = batch.real(_target(batch, networks, settings, seen, advantage)).float()
-    networks.q.train()
-    metrics = loss_of(row, batch, wanted, networks, settings)
-    state.descend("q", metrics["loss"])
-    return {name: value.detach() for name, value in metrics.items()}
+        errors.add_(summed(cell_of(batch.step[later], values.q[later]), (corrected - values.q)[later], errors.shape[1]))
+        wanted = batch.real(_target(batch, networks, settings, values, advantage)).float()
+    return step_towards(estimator, state, batch, wanted, settings)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="Beyond the paper: bootstrapped where Q is found right on the data, else the corrected return",
     settings=BlendSettings,
     target_value=TargetValue(
-        "between bootstrapped and corrected episode value, by the error that is measured", target, view="episodes"
+        "between bootstrapped and corrected episode value, by the error that is measured",
+        target,
+        view="episodes",
+        needs_return=False,
     ),
     action_selection=StochasticSearch(),
     paper=BlendSettings(loss="squared", centred=False, look_in_mirror=False),

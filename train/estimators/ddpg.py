@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import ActorNetwork
 from graspq.train.batch import Batch
-from graspq.train.estimator import Estimator, LaggedSettings, Metrics, TargetValue, regression
+from graspq.train.estimator import Estimator, LaggedSettings, Metrics, RegressionSettings, TargetValue, regression
 from graspq.train.networks import q_network, state_network
-from graspq.train.selection import FARTHEST_POINT, ActorNetwork, QOfActions, pointed
+from graspq.train.selection import FARTHEST_POINT, QOfActions, pointed
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import bootstrapped
 
@@ -20,7 +21,7 @@ STEEPEST = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class DdpgSettings(LaggedSettings):
+class DdpgSettings(LaggedSettings, RegressionSettings):
     """Options of `ddpg`."""
 
     actor_rest: float = setting(
@@ -41,12 +42,12 @@ def target(
     """
     image, step = batch.next_states
     action = pointed(networks.lagged["actor"](image, step), networks.specification.action).clamp(-1, 1)
-    next_value = networks.lagged_q.at(image, step)(action.unsqueeze(1)).squeeze(1)
-    return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), settings.discount)
+    next_value = networks.lagged_q.at(image, step)(action.unsqueeze(1))
+    return bootstrapped(batch.reward, batch.terminal, batch.in_place(next_value), settings.discount)
 
 
 def actor_critic(
-    row: Estimator[DdpgSettings],
+    estimator: Estimator[DdpgSettings],
     state: TrainState,
     batch: Batch,
     settings: DdpgSettings,
@@ -65,7 +66,7 @@ def actor_critic(
     start (`--actor-rest`); 6. its rate is a tenth of Q's (`--actor-rate`), as in Lillicrap et al. 2015; 7. it takes a
     step after every second of Q (`--actor-every`), as in Fujimoto et al. 2018.
     """
-    metrics = regression(row, state, batch, settings, random, progress)
+    metrics = regression(estimator, state, batch, settings, random, progress)
     if progress < settings.actor_rest or state.step % settings.actor_every != 0:
         return metrics
     networks = state.networks
@@ -107,10 +108,10 @@ def uphill(q_of_actions: QOfActions, direction: Tensor) -> Tensor:
     return torch.where(outward, back, gradient)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="Deep deterministic policy gradient: a network learns to give the action that Q rates best",
     settings=DdpgSettings,
-    target_value=TargetValue("bootstrapped", target, needs_next=True),
+    target_value=TargetValue("bootstrapped", target, needs_next=True, needs_return=False),
     action_selection=ActorNetwork(),
     paper=DdpgSettings(loss="squared", actor_rest=0.0, actor_rate=1.0, actor_every=1),
     parts={"q": q_network, "actor": state_network(lambda specification: specification.actions)},

@@ -9,22 +9,23 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
-from graspq.train.estimator import Estimator, LaggedSettings, TargetValue
-from graspq.train.selection import StochasticSearch, uniform_actions, uniform_search
+from graspq.train.estimator import Estimator, LaggedSettings, RegressionSettings, TargetValue
+from graspq.train.selection import uniform_actions
 from graspq.train.state import Networks
-from graspq.train.targets import bootstrapped
+from graspq.train.targets import bootstrapped, double_q
 
 
 @dataclasses.dataclass(frozen=True)
-class DqlSettings(LaggedSettings):
+class DqlSettings(LaggedSettings, RegressionSettings):
     """Options of `dql`."""
 
     candidates: int = setting(16, help="Uniform actions among which a target looks for the best.", minimum=1)
 
 
 def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torch.Generator, progress: float) -> Tensor:
-    """Return r + γ Q_θ'(s', a*), a* the best for Q_θ of N uniform actions; float [B, T]. See `targets.bootstrapped`.
+    """Return r + γ V(s'), V by double Q of N uniform actions; float [B, T]. See `targets.bootstrapped` and `double_q`.
 
     One trunk pass of each network on s', whatever the number of candidates.
 
@@ -34,15 +35,16 @@ def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torc
     """
     image, step = batch.next_states
     drawn = uniform_actions(random, len(image), settings.candidates, batch.action.shape[-1]).to(image.device)
-    best = uniform_search(networks.q.at(image, step), drawn)
-    next_value = networks.lagged_q.at(image, step)(best.action.unsqueeze(1)).squeeze(1)
-    return bootstrapped(batch.reward, batch.terminal, next_value.view_as(batch.reward), settings.discount)
+    next_value = double_q(networks.q.at(image, step)(drawn), drawn, networks.lagged_q.at(image, step))
+    return bootstrapped(batch.reward, batch.terminal, batch.in_place(next_value), settings.discount)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="Double Q-learning: the reward and the discounted value of the best next action",
     settings=DqlSettings,
-    target_value=TargetValue("bootstrapped (double Q, lagged target network)", target, needs_next=True),
+    target_value=TargetValue(
+        "bootstrapped (double Q, lagged target network)", target, needs_next=True, needs_return=False
+    ),
     action_selection=StochasticSearch(),
     paper=DqlSettings(loss="squared"),
 )

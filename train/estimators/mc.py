@@ -4,14 +4,15 @@ Dimensions: B batch, T steps.
 """
 
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from graspq.common.options import setting
+from graspq.train.acting import StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, RegressionSettings, TargetValue
-from graspq.train.selection import StochasticSearch
 from graspq.train.state import Networks
 from graspq.train.targets import episode_value
 
@@ -28,8 +29,12 @@ class McSettings(RegressionSettings):
         none="data",
     )
 
+    def chosen_discount(self, stored: float) -> float:
+        """Return γ of the return."""
+        return stored if self.discount is None else self.discount
 
-def target(batch: Batch, networks: Networks, settings: McSettings, random: torch.Generator, progress: float) -> Tensor:
+
+def target(batch: Batch, networks: Networks, settings: Any, random: torch.Generator, progress: float) -> Tensor:
     """Return the observed return, float [B, T]; see `targets.episode_value`.
 
     Source: Quillen et al. 2018, section "Regression with Monte Carlo Return Estimates".
@@ -38,7 +43,7 @@ def target(batch: Batch, networks: Networks, settings: McSettings, random: torch
     return episode_value(batch.mc_return)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="Monte-Carlo evaluation: the return that the episode really had",
     settings=McSettings,
     target_value=TargetValue("episode value", target),

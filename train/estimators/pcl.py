@@ -12,11 +12,12 @@ from torch import Tensor, nn
 from graspq.common.action_space import ActionSpace
 from graspq.common.options import setting
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import ActorNetwork
 from graspq.train.batch import Batch
-from graspq.train.estimator import LOSSES, Estimator, EstimatorSettings, Metrics, TargetValue
+from graspq.train.estimator import LOSSES, Estimator, LaggedSettings, Metrics, TargetValue
 from graspq.train.networks import state_network
 from graspq.train.recipe import PAPER
-from graspq.train.selection import ActorNetwork, pointed
+from graspq.train.selection import pointed
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import path_consistent
 
@@ -29,11 +30,9 @@ STATISTICS_STATES = 64
 
 
 @dataclasses.dataclass(frozen=True)
-class PclSettings(EstimatorSettings):
+class PclSettings(LaggedSettings):
     """Options of `pcl`."""
 
-    discount: float = setting(0.9, help="Discount.", minimum=0, maximum=1)
-    lag_steps: int = setting(50, help="Steps between copies of the weights into the lagged networks.", minimum=1)
     actor_rate: float = setting(0.1, help="Learning rate of the actor over that of V.", minimum=0, maximum=10)
     path_steps: int | None = setting(
         None, help="Steps d of a path; all: the rest of the episode.", minimum=1, none="all"
@@ -114,7 +113,7 @@ def target(batch: Batch, networks: Networks, settings: PclSettings, random: torc
 
 
 def path_consistency(
-    row: Estimator[PclSettings],
+    estimator: Estimator[PclSettings],
     state: TrainState,
     batch: Batch,
     settings: PclSettings,
@@ -148,7 +147,7 @@ def path_consistency(
 
 
 def residual(
-    row: Estimator[PclSettings],
+    estimator: Estimator[PclSettings],
     batch: Batch,
     networks: Networks,
     settings: PclSettings,
@@ -201,11 +200,11 @@ def _value_and_target(batch: Batch, networks: Networks, settings: PclSettings) -
         with torch.no_grad():
             lagged = policy_of(networks.lagged["actor"](image, step), space)
     log_ratio = log_density(policy, action) - log_density(lagged, action)
-    padded = _padded(value, batch)
+    padded = batch.in_place(value)
     wanted = path_consistent(
         batch.reward,
         padded,
-        _padded(log_ratio, batch),
+        batch.in_place(log_ratio),
         _penalty(networks, settings),
         settings.discount,
         settings.path_steps,
@@ -225,22 +224,18 @@ def _divide_gradients(network: nn.Module, divisor: Tensor | float) -> None:
             parameter.grad.div_(divisor)
 
 
-def _padded(values: Tensor, batch: Batch) -> Tensor:
-    """Return values of the real steps, [n], in their places in [B, T], 0 elsewhere."""
-    if batch.mask is None:
-        return values.view_as(batch.reward)
-    return torch.zeros_like(batch.reward).masked_scatter(batch.mask, values)
-
-
 def _mean_square(batch: Batch, value: Tensor, target: Tensor) -> Tensor:
     return 0.5 * batch.real(value - target).square().mean()
 
 
-ROW = Estimator(
+row = Estimator(
     summary="Trust-PCL: V and a Gaussian policy, made consistent along logged paths near its lagged copy",
     settings=PclSettings,
     target_value=TargetValue(
-        "corrected episode value (Trust-PCL: relative entropy to a lagged policy)", target, view="episodes"
+        "corrected episode value (Trust-PCL: relative entropy to a lagged policy)",
+        target,
+        view="episodes",
+        needs_return=False,
     ),
     action_selection=ActorNetwork(),
     paper=PclSettings(discount=0.95, actor_rate=1.0, path_steps=10, penalty=3.0),

@@ -11,33 +11,23 @@ import torch
 from torch import Tensor
 
 from graspq.datasets.pool import ShardPool
+from graspq.train.acting import Acting, ObservedState, StochasticSearch
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, RegressionSettings, TargetValue
-from graspq.train.search_settings import CemSettings
-from graspq.train.selection import Acting, SearchSpace, StochasticSearch, one_step_of
-from graspq.train.state import Networks
-from graspq.train.targets import episode_value
+from graspq.train.estimators import mc
+from graspq.train.search_settings import CemSettings, StepMode
+from graspq.train.selection import SearchSpace
 
 PREFIX = "synthetic_"
 
 
 @dataclasses.dataclass(frozen=True)
 class SupervisedSettings(RegressionSettings):
-    """Options of `supervised`."""
+    """Options of `supervised`; its target is that of `mc`, the return, which without discount is the outcome."""
 
     def chosen_discount(self, stored: float) -> float:
         """Return 1: the outcome has no discount."""
         return 1.0
-
-
-def target(
-    batch: Batch, networks: Networks, settings: SupervisedSettings, random: torch.Generator, progress: float
-) -> Tensor:
-    """Return the outcome, which is the return without discount; float [B, T]. See `targets.episode_value`.
-
-    Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning".
-    """
-    return episode_value(batch.mc_return)
 
 
 def synthetic_action(batch: Batch) -> Tensor:
@@ -97,6 +87,24 @@ def cut_to(space: SearchSpace, low: Tensor, high: Tensor) -> SearchSpace:
     return space._replace(low=reachable(space.low), high=reachable(space.high))
 
 
+def one_step_of(displacement: Tensor, mode: StepMode) -> Tensor:
+    """Return the first step of a displacement that may need several, as an action.
+
+        scale:  a = d / max(1, maxᵢ |dᵢ|)     a straight line, all parts arrive together
+        clip:   aᵢ = clip(dᵢ, -1, 1)          each part as fast as it may
+
+    Args:
+        displacement: d, float [B, A] in units of the action limits.
+        mode: see above.
+
+    Returns:
+        float [B, A] in [-1, 1].
+    """
+    if mode == "clip":
+        return displacement.clamp(-1, 1)
+    return displacement / displacement.abs().amax(-1, keepdim=True).clamp(min=1)
+
+
 class SearchOfMotions(StochasticSearch):
     """The cross-entropy method over whole motions to the last pose, as the network learned them; one step is taken.
 
@@ -105,26 +113,26 @@ class SearchOfMotions(StochasticSearch):
     the gripper is known the range is cut to end poses inside the workspace; no network sees the pose.
     """
 
-    def space(self, acting: Acting, near: Tensor, step: Tensor, pose: Tensor | None) -> SearchSpace:
+    def space(self, acting: Acting, state: ObservedState, near: Tensor) -> SearchSpace:
         """Return the motions of the data at this step that end inside the workspace."""
-        space = SearchSpace(*(bound.to(near) for bound in motions_at(acting.kept, step)))
-        if pose is None or acting.pose_bounds is None:
+        space = SearchSpace(*(bound.to(near) for bound in motions_at(acting.kept, state.step)))
+        if state.pose is None or acting.pose_bounds is None:
             return space
         low, high = acting.pose_bounds
         limits = torch.tensor(acting.action.limits, device=near.device)
-        return cut_to(space, (low - pose) / limits, (high - pose) / limits)
+        return cut_to(space, (low - state.pose) / limits, (high - state.pose) / limits)
 
     def executed(self, found: Tensor, cem: CemSettings) -> Tensor:
         """Return the first step of a motion."""
         return one_step_of(found, cem.synthetic_step)
 
 
-ROW = Estimator(
+row = Estimator(
     summary="The outcome of the episode, as if one motion had led from the current pose to the last one",
     settings=SupervisedSettings,
-    target_value=TargetValue("episode value, on synthetic actions", target),
+    target_value=TargetValue("episode value, on synthetic actions", mc.target),
     action_selection=SearchOfMotions(),
     paper=SupervisedSettings(loss="squared"),
-    action=synthetic_action,
+    regressed_action=synthetic_action,
     kept=measured_motions,
 )

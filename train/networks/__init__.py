@@ -11,9 +11,9 @@ from torch import nn
 
 from graspq.common.named_objects import named_row
 from graspq.train.networks import default, paper
-from graspq.train.networks.network import NetworkFamily, NetworkSpecification
+from graspq.train.networks.network import NetworkFamily, NetworkSpecification, QNetwork
 
-NETWORKS: dict[str, NetworkFamily] = {"default": default.NETWORK, "paper": paper.NETWORK}
+NETWORKS: dict[str, NetworkFamily] = {"default": default.network, "paper": paper.network}
 
 Maker = Callable[[NetworkSpecification], nn.Module]
 Parts = Mapping[str, Maker]
@@ -32,9 +32,7 @@ def network_named(name: str) -> NetworkFamily:
 
 def q_network(specification: NetworkSpecification) -> nn.Module:
     """Return Q(s, a) of the specification's `--network`: the maker of the part `q` of most estimators."""
-    network = network_named(specification.name).q(specification)
-    network.link = specification.link
-    return network
+    return network_named(specification.name).q(specification)
 
 
 def state_network(outputs: int | Callable[[NetworkSpecification], int]) -> Maker:
@@ -66,5 +64,7 @@ def build(maker: Maker, specification: NetworkSpecification, generator: torch.Ge
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = maker(specification)
+    if isinstance(network, QNetwork):
+        network.link = specification.link
     # torch's annotations do not know that modules take a memory format.
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]

@@ -197,4 +197,4 @@ def _computing_type(device: str) -> torch.dtype:
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else torch.float32
 
 
-NETWORK = NetworkFamily(DefaultNetwork, DefaultStateNetwork)
+network = NetworkFamily(DefaultNetwork, DefaultStateNetwork)

@@ -159,4 +159,4 @@ def _initialise(network: nn.Module) -> None:
                 nn.init.zeros_(module.bias)
 
 
-NETWORK = NetworkFamily(PaperNetwork, PaperStateNetwork, PaperNetworkSettings)
+network = NetworkFamily(PaperNetwork, PaperStateNetwork, PaperNetworkSettings)

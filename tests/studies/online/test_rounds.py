@@ -22,7 +22,7 @@ from graspq.policies.of_run import load
 from graspq.studies.online import growth
 from graspq.studies.online.resolve import Plan
 from graspq.studies.online.rounds import run_online
-from graspq.train import loop
+from graspq.train import loop, session
 from graspq.train.estimators import ESTIMATORS
 from graspq.train.run import Run
 from graspq.train.search_settings import CemSettings
@@ -119,12 +119,12 @@ COLLECTING = [
     (growth, "write_card", 2),  # in the manifest, the card is that of the round before
 ]
 TRAINING = [
-    (loop, "save_checkpoint", 1),  # before the first
+    (session, "save_checkpoint", 1),  # before the first
     (Run, "append_metrics", 1),  # grasps are committed, their row is missing
-    (loop.Session, "update", 9),  # between two checkpoints
-    (loop, "save_checkpoint", 2),  # at one
+    (loop, "update", 9),  # between two checkpoints
+    (session, "save_checkpoint", 2),  # at one
     (Run, "append_metrics", 4),
-    (loop.Session, "update", 2),
+    (loop, "update", 2),
 ]
 
 

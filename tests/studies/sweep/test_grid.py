@@ -97,7 +97,7 @@ OWN_ROW = """
 import dataclasses
 from graspq.common.options import setting
 from graspq.train.estimator import Estimator, RegressionSettings, TargetValue
-from graspq.train.selection import StochasticSearch
+from graspq.train.acting import StochasticSearch
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,17 +7,10 @@ import torch
 from plain import plain_networks
 from torch import Tensor
 
+from graspq.train.advantages import LaggedValues, advantages, lagged_values
 from graspq.train.batch import Batch
 from graspq.train.estimator import cross_entropy
-from graspq.train.estimators.corr_mc import (
-    CorrMcSettings,
-    Judged,
-    advantages,
-    annealed,
-    centred_advantage,
-    judged,
-    target,
-)
+from graspq.train.estimators.corr_mc import CorrMcSettings, annealed, target
 from graspq.train.networks.network import Features, QNetwork
 from graspq.train.selection import uniform_actions
 from graspq.train.state import Networks, seeded
@@ -56,8 +49,8 @@ def settings(**given: Any) -> CorrMcSettings:
     return CorrMcSettings(**plain | given)
 
 
-def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> Judged:
-    return judged(batch, given, chosen, seeded("tests/draws"))
+def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> LaggedValues:
+    return lagged_values(batch, given, chosen, seeded("tests/draws"))
 
 
 def sampled_advantage(batch: Batch, given: Networks, chosen: CorrMcSettings) -> Tensor:
@@ -174,12 +167,12 @@ def test_the_best_of_noisy_values_is_judged_too_high_by_what_order_statistics_sa
     assert bias == pytest.approx(expected, abs=0.02)
 
 
-def judged_at_random(mask: Tensor) -> Judged:
+def judged_at_random(mask: Tensor) -> LaggedValues:
     generator = seeded("tests/judged")
     q, value = torch.rand(2, *mask.shape, generator=generator)
     unread = ~mask | (torch.arange(mask.shape[1]) == 0)
     q = torch.where(unread, torch.nan, q)
-    return Judged(torch.where(unread, torch.nan, torch.maximum(q, value)), q)
+    return LaggedValues(torch.where(unread, torch.nan, torch.maximum(q, value)), q)
 
 
 def test_centred_targets_are_on_average_those_of_bootstrapping_and_keep_the_differences_between_episodes() -> None:
@@ -207,9 +200,11 @@ def test_centring_changes_nothing_where_the_lagged_network_is_right_on_average()
         wanted = corrected_episode_value(batch.reward, q - seen.value, 0.7, 0.9, mask)
         q = q.clone()
         q[:, t] += (wanted - q)[:, t][mask[:, t]].mean()
-    right = Judged(seen.value, q)
+    right = LaggedValues(seen.value, q)
     plain = q - seen.value
-    torch.testing.assert_close(centred_advantage(batch, right, 0.7, 0.9), plain, equal_nan=True, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        advantages(batch, right, 0.7, settings(centred=True)), plain, equal_nan=True, rtol=0, atol=1e-6
+    )
 
 
 def test_cross_entropy_takes_targets_outside_zero_and_one_and_clipping_them_would_bring_bias() -> None:

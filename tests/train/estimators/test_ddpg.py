@@ -79,7 +79,7 @@ def test_the_target_judges_the_lagged_actors_action_by_the_lagged_critic_and_cli
     )
     found = target(batch(), networks, DdpgSettings(), seeded("tests/draws"), 0.0)
     torch.testing.assert_close(found, torch.tensor([[0.9 * (2.0 + 1.0)], [1.0]]))
-    with pytest.raises(ValueError, match="next_image"):
+    with pytest.raises(ValueError, match="needs_next=True"):
         target(batch(next_image=None), networks, DdpgSettings(), seeded("tests/draws"), 0.0)
 
 

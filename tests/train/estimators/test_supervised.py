@@ -13,7 +13,13 @@ from graspq.datasets.dataset import open_shards
 from graspq.datasets.pool import ShardPool
 from graspq.train.checkpoint import load_acting
 from graspq.train.estimators import ESTIMATORS
-from graspq.train.estimators.supervised import SearchOfMotions, SupervisedSettings, measured_motions, motions_at
+from graspq.train.estimators.supervised import (
+    SearchOfMotions,
+    SupervisedSettings,
+    measured_motions,
+    motions_at,
+    one_step_of,
+)
 from graspq.train.loop import train
 from graspq.train.selection import SearchSpace
 from graspq.train.settings import TrainSettings
@@ -87,4 +93,11 @@ def test_labels_are_outcomes_without_discount_whatever_the_datasets_discount_is(
 def test_the_row_regresses_on_synthetic_actions() -> None:
     row = ESTIMATORS["supervised"]
     batch = SimpleNamespace(action="logged", synthetic_action="synthetic")
-    assert row.action(batch) == "synthetic" and isinstance(row.action_selection, SearchOfMotions)  # type: ignore[arg-type]
+    assert row.regressed_action(batch) == "synthetic" and isinstance(row.action_selection, SearchOfMotions)  # type: ignore[arg-type]
+
+
+def test_a_step_of_a_motion_is_scaled_along_its_line_or_clipped_and_a_short_motion_is_one_step() -> None:
+    motion = torch.tensor([[1.0, -2.0, -4.0, 0.5], [0.1, 0.0, -0.9, 1.0]])
+    scaled, clipped = one_step_of(motion, "scale"), one_step_of(motion, "clip")
+    assert torch.equal(scaled, torch.tensor([[0.25, -0.5, -1.0, 0.125], [0.1, 0.0, -0.9, 1.0]]))
+    assert torch.equal(clipped, torch.tensor([[1.0, -1.0, -1.0, 0.5], [0.1, 0.0, -0.9, 1.0]]))

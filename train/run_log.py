@@ -25,7 +25,7 @@ BOUNDS = {"q": 10.0, "v": 10.0, "target": 10.0, "loss": 100.0}
 LOG_EVERY = 50
 
 
-class Progress:
+class RunLog:
     """Collects losses and times between two rows of metrics; a context manager."""
 
     def __init__(self, run: Run, settings: TrainSettings, step: int, show: bool, writes: bool) -> None:
@@ -52,7 +52,7 @@ class Progress:
         self._first = step + 1
         self._seconds = 0.0
 
-    def __enter__(self) -> "Progress":
+    def __enter__(self) -> "RunLog":
         return self
 
     def __exit__(self, *_: object) -> None:

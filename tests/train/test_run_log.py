@@ -9,21 +9,22 @@ import torch
 
 from graspq.train import loop
 from graspq.train.checkpoint import load_acting
-from graspq.train.loop import DivergedError, train
+from graspq.train.loop import train
 from graspq.train.networks.network import QNetwork
-from graspq.train.progress import Progress
 from graspq.train.run import Run
+from graspq.train.run_log import RunLog
+from graspq.train.session import DivergedError
 from graspq.train.settings import TrainSettings
 
 Make = Callable[..., TrainSettings]
 
 
 def logged(settings: TrainSettings, folder: Path, steps: list[tuple[float, float]]) -> tuple[int, str] | None:
-    with Progress(Run(folder, {}), settings, 40, show=False, writes=True) as progress:
+    with RunLog(Run(folder, {}), settings, 40, show=False, writes=True) as log:
         for loss, q in steps:
-            with progress.timed():
-                progress.count({"loss": torch.tensor(loss), "q": torch.tensor(q)})
-        return progress.log(40 + len(steps), 0.1)
+            with log.timed():
+                log.count({"loss": torch.tensor(loss), "q": torch.tensor(q)})
+        return log.log(40 + len(steps), 0.1)
 
 
 def test_values_of_the_tasks_size_are_logged(settings: Make, tmp_path: Path) -> None:
