@@ -95,7 +95,7 @@ def moments(simulation: GraspSimulation, seed: int) -> Iterator[None]:
     simulation.reset(rng)
     while not simulation.terminated:
         yield
-        simulation.step(rng.uniform(-1, 1, 4) * (1, 1, 0.5, 1), observe_end=False)
+        simulation.step(rng.uniform(-1, 1, 4) * (1, 1, 0.5, 1))
 
 
 def seconds_of(simulation: GraspSimulation, draw: Draw, size: int) -> Callable[[int], float]:

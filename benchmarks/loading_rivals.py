@@ -5,6 +5,7 @@ dictionaries of tensors with `image` and `next_image`, uint8 [B, H, W, C] (LeRob
 """
 
 import io
+import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,10 @@ class Frames:
             yield from self.pool.read_block(ref).images
 
     def stacked(self, pictures: list[bytes]) -> Tensor:
-        """Return pictures, given as raw bytes, as uint8 [B, H, W, C]."""
-        return torch.from_numpy(np.frombuffer(b"".join(pictures), np.uint8).reshape(-1, *self.pool.image_shape).copy())
+        """Return pictures, raw RGB or PPM with a header before it, as uint8 [B, H, W, C]."""
+        shape = self.pool.image_shape
+        raw = b"".join(picture[-math.prod(shape) :] for picture in pictures)
+        return torch.from_numpy(np.frombuffer(raw, np.uint8).reshape(-1, *shape).copy())
 
 
 def as_png(picture: npt.NDArray[np.uint8]) -> bytes:

@@ -111,7 +111,7 @@ def _collect_episode(
 ) -> Episode:
     seed = integer_seed("datagen/episode", settings.seed, episode_id)
     simulation.reset(generator("datagen/scene", seed))
-    played = play(simulation, policy, generator("datagen/policy", seed), observe_end=False)
+    played = play(simulation, policy, generator("datagen/policy", seed))
     return Episode(
         episode_id=episode_id,
         block=block,
@@ -123,9 +123,10 @@ def _collect_episode(
         rewards=played.rewards,
         gripper_poses=np.stack([observation.gripper_pose for observation in played.observations]),
         final_pose=played.final_pose,
-        end=played.end,
+        ended_by=played.ended_by,
         success=played.success,
         lifted_object=played.lifted_object,
         policy=policy.name,
         exploration=policy.exploration,
+        final_image=played.last,
     )

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
-from graspq.datasets.columns import RecordType
+from graspq.datasets.columns import RecordType, current_names
 from graspq.datasets.episode import Int64, UInt8
+from graspq.datasets.images import from_arrow, only
 from graspq.datasets.labels import mc_return
 from graspq.datasets.tables import to_numpy
 
@@ -122,17 +124,17 @@ def read_block(
         UserError: the file is missing, truncated or damaged; the message names the file and the block.
     """
     names = (dtype.names or ())[:-1]
-    columns = read_columns(ref, (*names, "image"), metadata)
     with readable(f"{ref.path}: block {ref.block}"):
-        records = np.zeros(len(columns["image"]), dtype)
+        table = _row_group(ref, [*names, "image"], metadata)
+        images = from_arrow(only(table.column("image")), image_shape)
+        records = np.zeros(len(images), dtype)
         for name in names:
-            records[name] = columns[name]
+            records[name] = to_numpy(table.column(name))
         records["block"] = ref.block
         terminal = records["terminal"]
         first_rows = np.flatnonzero(np.concatenate([[True], terminal[:-1]])).astype(np.int64)
         if len(records) != ref.rows or len(first_rows) != ref.episodes or not terminal[-1]:
             raise ValueError(f"expected {ref.rows} rows of {ref.episodes} whole episodes")
-        images = columns["image"].reshape(-1, *image_shape)
     lengths = np.diff(np.append(first_rows, len(records)))
     return BlockArrays(ref.block, images, records, first_rows, lengths)
 
@@ -142,25 +144,31 @@ def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> d
 
     Args:
         ref: the block.
-        names: of columns of the steps table.
+        names: of columns of the steps table, not the image.
         metadata: the file's footer where it was read before.
 
     Raises:
         UserError: the file is missing, truncated or damaged; the message names the file and the block.
     """
     with readable(f"{ref.path}: block {ref.block}"):
-        with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
-            table = file.read_row_group(ref.row_group, columns=list(names), use_threads=False)
+        table = _row_group(ref, list(names), metadata)
         return {name: to_numpy(table.column(name)) for name in names}
 
 
-def read_episode_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of an episodes table; columns as in `columns.EPISODES`.
+def _row_group(ref: BlockRef, names: list[str], metadata: Any) -> pa.Table:
+    with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
+        return file.read_row_group(ref.row_group, columns=names, use_threads=False)
+
+
+def read_episode_rows(path: Path, block: int | None = None) -> list[dict[str, Any]]:
+    """Return the rows of an episodes table, or those of one block; columns as in `columns.EPISODES`.
 
     Raises:
         UserError: the file is missing or damaged.
     """
     with readable(f"{path}:"):
         table = pq.read_table(path, page_checksum_verification=True, use_threads=False, partitioning=None)
-        rows: list[dict[str, Any]] = table.to_pylist()
+        if block is not None:
+            table = table.filter(pc.field("block") == block)
+        rows: list[dict[str, Any]] = table.rename_columns(current_names(table.column_names)).to_pylist()
     return rows

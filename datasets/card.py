@@ -6,7 +6,6 @@ Its text depends on the manifest alone. The manifest lists its digest, so that `
 import bisect
 import dataclasses
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -14,12 +13,13 @@ from graspq.common.files import write_text
 from graspq.common.text import markdown
 from graspq.datasets import columns
 from graspq.datasets.columns import VARYING, Column, Sizes, quantities, sizes_of
+from graspq.datasets.images import header
 from graspq.datasets.manifest import Manifest, steps_file
 
 CARD_NAME = "README.md"
 SIZE_CATEGORIES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "n>100M")
 
-# Older versions of Hugging Face `datasets` cannot infer a fixed-size binary column: the types are declared therefore.
+# The types are declared, so that the images are images to Hugging Face `datasets` and its viewer.
 TEMPLATE = """\
 ---
 pretty_name: graspq {task}, {episodes:,} grasps
@@ -63,14 +63,15 @@ meshes ({objects}).
 
 ## Reading it
 
-Five lines of Python give the images of a shard as numpy, `uint8 [N, {height}, {width}, 3]`, without a copy:
+An image is a PPM file: {header} bytes of header, then raw RGB. Any image library decodes it, and five lines of Python
+give the images of a shard as numpy, `uint8 [N, {height}, {width}, 3]`, without a copy:
 
 ```python
 import numpy as np
 import pyarrow.parquet as pq
-table = pq.read_table("{first_shard}", page_checksum_verification=True)
-column = table["image"].combine_chunks()
-images = np.frombuffer(column.buffers()[1], np.uint8).reshape(-1, {height}, {width}, 3)
+column = pq.read_table("{first_shard}", page_checksum_verification=True)["image"].combine_chunks()
+files = np.frombuffer(column.buffers()[2], np.uint8).reshape(len(column), -1)
+images = files[:, {header}:].reshape(-1, {height}, {width}, 3)
 ```
 
 or row by row with Hugging Face `datasets`:
@@ -78,7 +79,7 @@ or row by row with Hugging Face `datasets`:
 ```python
 from datasets import load_dataset
 steps = load_dataset("path/of/this/folder", "steps", split="train")
-image = np.frombuffer(steps[0]["image"], np.uint8).reshape({height}, {width}, 3)
+steps[0]["image"].show()  # a Pillow image; with_format("torch") gives tensors
 ```
 
 ## Steps
@@ -94,7 +95,7 @@ An action of 1 commands {limits}.
 
 
 def card_text(manifest: Manifest) -> str:
-    """Return the card of a dataset of at least one shard."""
+    """Return the card of a dataset of format 2 and at least one shard."""
     height, width, _ = manifest.image_shape
     action = manifest.action
     facts = {
@@ -103,6 +104,7 @@ def card_text(manifest: Manifest) -> str:
         "discount": f"{manifest.discount:g}",
         "height": height,
         "width": width,
+        "header": len(header(manifest.image_shape)),
     }
     sizes = sizes_of(manifest.image_shape, action)
     return TEMPLATE.format(
@@ -141,7 +143,7 @@ def _table(described: Sequence[Column], sizes: Sizes, facts: Mapping[str, object
 def _type(column: Column, sizes: Sizes) -> str:
     dimensions = column.dimensions(sizes)
     if column.dtype == "uint8":
-        return f"{math.prod(dimensions)} bytes"
+        return "PPM"
     varying = "list of " if VARYING in dimensions else ""
     return varying + column.dtype + "".join(f"[{size}]" for size in dimensions if size != VARYING)
 
@@ -150,8 +152,8 @@ def _features(described: Sequence[Column], sizes: Sizes) -> str:
     """Return the YAML lines that declare the types of a table."""
     lines = []
     for column in described:
-        dtype = "binary" if column.dtype == "uint8" else column.dtype
-        dimensions = () if dtype == "binary" else column.dimensions(sizes)
+        dtype = "image" if column.dtype == "uint8" else column.dtype
+        dimensions = () if dtype == "image" else column.dimensions(sizes)
         lines += [f"  - name: {column.name}", *(f"    {line}" for line in _feature(dtype, dimensions))]
     return "\n".join(lines)
 

@@ -100,6 +100,7 @@ def _described(path: Path, manifest: Manifest) -> dict[str, str]:
         raise UserError(f"{path}: the dataset has no finished shard yet; run the command that makes it again")
     return {
         "dataset": str(path),
+        "format": str(manifest.format_version),
         "task": manifest.task_name,
         "episodes": f"{manifest.episodes:,}",
         "rows": f"{manifest.rows:,}",

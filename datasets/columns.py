@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from graspq.common.action_space import ActionSpace
+from graspq.datasets import images
 from graspq.datasets.episode import Episode
 from graspq.datasets.labels import mc_return, synthetic_action
 from graspq.datasets.manifest import Manifest
@@ -34,6 +35,8 @@ class Column:
         meaning: a line of the dataset card; `{action}`, `{pose}`, `{discount}` and `{height}`, `{width}` are filled in.
         metadata: order, units and the like as JSON values, stored with the Parquet field.
         nullable: whether a row may hold nothing.
+        since: the first format of a dataset that has it.
+        in_format_1: its name there, where it has another now.
     """
 
     name: str
@@ -42,15 +45,21 @@ class Column:
     meaning: str
     metadata: Callable[[Manifest], dict[str, Any]] = lambda manifest: {}
     nullable: bool = False
+    since: int = 1
+    in_format_1: str | None = None
 
     def dimensions(self, sizes: Sizes) -> tuple[int, ...]:
         """Return its shape in numbers, `VARYING` for one that varies."""
         return tuple(size if isinstance(size, int) else sizes[size] for size in self.shape)
 
-    def arrow_type(self, sizes: Sizes) -> pa.DataType:
-        """Return its type in Parquet: bytes for an image, lists for other arrays."""
+    def stored_name(self, format_version: int) -> str:
+        """Return its name in the files of a format."""
+        return self.in_format_1 if format_version == 1 and self.in_format_1 is not None else self.name
+
+    def arrow_type(self, sizes: Sizes, format_version: int) -> pa.DataType:
+        """Return its type in Parquet: bytes for an image (see `images`), lists for other arrays."""
         if self.dtype == "uint8":
-            return pa.binary(math.prod(self.dimensions(sizes)))
+            return pa.binary(math.prod(self.dimensions(sizes)) if format_version == 1 else -1)
         kind = pa.type_for_alias(self.dtype)
         for size in reversed(self.dimensions(sizes)):
             kind = pa.list_(pa.field("element", kind, nullable=False), size)
@@ -68,8 +77,10 @@ class EpisodeColumn(Column):
     value: Callable[[Episode], Any] | None = None
 
     def of(self, episode: Episode) -> Any:
-        """Return its value in the row of an episode, arrays as lists."""
+        """Return its value in the row of an episode: arrays as lists, an image as a PPM."""
         value = getattr(episode, self.name) if self.value is None else self.value(episode)
+        if self.dtype == "uint8":
+            return images.encoded(value)
         return value.tolist() if isinstance(value, np.ndarray) else value
 
 
@@ -95,7 +106,8 @@ def phi_range(manifest: Manifest) -> dict[str, Any]:
 
 
 def _image(manifest: Manifest) -> dict[str, Any]:
-    return {"shape": list(manifest.image_shape), "dtype": "uint8", "layout": "H W C", "color": "RGB"}
+    shape = {"shape": list(manifest.image_shape), "dtype": "uint8", "layout": "H W C", "color": "RGB"}
+    return shape if manifest.format_version == 1 else shape | {"encoding": "PPM"}
 
 
 def _action(manifest: Manifest) -> dict[str, Any]:
@@ -144,7 +156,8 @@ def _synthetic_action(steps: Row, episode: Row, manifest: Manifest) -> Any:
 STEPS = (
     StepColumn("episode_id", "int64", (), "number of the attempt", label=_episode_id),
     StepColumn("step", "int32", (), "number of the step in its attempt, from 0", label=_step),
-    StepColumn("image", "uint8", ("H", "W", "C"), "RGB before the action, {height} x {width} x 3 uint8, row by row",
+    StepColumn("image", "uint8", ("H", "W", "C"),
+               "RGB before the action, {height} x {width} x 3 uint8, row by row behind the header",
                _image, value=lambda episode: episode.images),
     StepColumn("action", "float32", ("A",), "{action} in units of the action limits, in [-1, 1]",
                _action, value=lambda episode: episode.actions),
@@ -168,13 +181,17 @@ EPISODES = (
     EpisodeColumn("object_poses", "float32", ("K", 7), "x, y, z (m), qx, qy, qz, qw of each after settling",
                   _object_pose),
     EpisodeColumn("steps", "int32", (), "number of steps"),
-    EpisodeColumn("end", "string", (),
-                  "`height`: the gripper went below the height threshold; `T`: the last allowed step"),
+    EpisodeColumn("ended_by", "string", (),
+                  "`height`: the gripper went below the height threshold; `T`: the last allowed step",
+                  in_format_1="end"),
     EpisodeColumn("success", "bool", (), "whether the attempt succeeded"),
     EpisodeColumn("lifted_object", "string", (), "what was lifted, if anything", nullable=True),
     EpisodeColumn("policy", "string", (), "what acted"),
     EpisodeColumn("exploration", "float64", (), "its exploration parameter"),
     EpisodeColumn("final_pose", "float32", ("A",), "{pose} after the last action, before the scripted descent", _pose),
+    EpisodeColumn("final_image", "uint8", ("H", "W", "C"),
+                  "RGB at the end, after the gripper has closed and lifted, {height} x {width} x 3 uint8",
+                  _image, since=2),
 )
 # fmt: on
 
@@ -197,13 +214,21 @@ def batch_columns() -> list[str]:
     return [*(column.name for column in STEPS if column.batches and column.name != "image"), "block"]
 
 
-def episode_row(episode: Episode) -> dict[str, Any]:
-    """Return the row of an episode in the episodes table."""
-    return {column.name: column.of(episode) for column in EPISODES}
+def current_names(stored: Sequence[str]) -> list[str]:
+    """Return the names of the episodes table's columns, whichever format they are stored in."""
+    former = {column.in_format_1: column.name for column in EPISODES}
+    return [former.get(name, name) for name in stored]
 
 
-def step_values(episode: Episode, row: Row, manifest: Manifest) -> dict[str, Any]:
-    """Return the columns of an episode's steps, [T, ...] each; `row` is its row in the episodes table."""
+def episode_row(episode: Episode, format_version: int) -> dict[str, Any]:
+    """Return the row of an episode in the episodes table, columns as a format stores them."""
+    described = [column for column in EPISODES if column.since <= format_version]
+    return {column.stored_name(format_version): column.of(episode) for column in described}
+
+
+def step_values(episode: Episode, manifest: Manifest) -> dict[str, Any]:
+    """Return the columns of an episode's steps, [T, ...] each."""
+    row = episode_row(episode, manifest.format_version)
     values = {column.name: column.value(episode) for column in STEPS if column.value is not None}
     for column in STEPS:
         if column.label is not None:

@@ -32,11 +32,12 @@ class Episode:
         rewards: float32 [T].
         gripper_poses: float32 [T, A], measured before each action, in the units of the action space; angles unwrapped.
         final_pose: float32 [A], measured after the last action and before the scripted descent.
-        end: what ended it, `"height"` (the height trigger) or `"T"` (the last allowed step).
+        ended_by: what ended it, `"height"` (the height trigger) or `"T"` (the last allowed step).
         success: whether it counts as a success of the task.
         lifted_object: name of the object that was lifted, or None.
         policy: name of the policy that acted.
         exploration: the policy's own exploration parameter, such as the probability of descending.
+        final_image: uint8 [H, W, 3], RGB after the gripper has closed and lifted; None where the data lack it.
 
     Raises:
         ValueError: a shape, dtype or name is not as stated.
@@ -52,11 +53,12 @@ class Episode:
     rewards: Float32
     gripper_poses: Float32
     final_pose: Float32
-    end: End
+    ended_by: End
     success: bool
     lifted_object: str | None
     policy: str
     exploration: float
+    final_image: UInt8 | None = None
 
     def __post_init__(self) -> None:
         steps = len(self.images)
@@ -69,8 +71,10 @@ class Episode:
         _check("gripper_poses", self.gripper_poses, np.float32, (steps, size))
         _check("final_pose", self.final_pose, np.float32, (size,))
         _check("object_poses", self.object_poses, np.float32, (len(self.object_ids), 7))
-        if self.end not in ENDS:
-            raise ValueError(f"end: expected one of {', '.join(ENDS)}, got {self.end!r}")
+        if self.final_image is not None:
+            _check("final_image", self.final_image, np.uint8, self.images.shape[1:])
+        if self.ended_by not in ENDS:
+            raise ValueError(f"ended_by: expected one of {', '.join(ENDS)}, got {self.ended_by!r}")
         if min(self.episode_id, self.block, self.seed) < 0:
             raise ValueError("episode_id, block and seed are whole numbers of at least 0")
 

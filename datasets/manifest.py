@@ -15,10 +15,11 @@ from graspq.common.action_space import ActionSpace, grasping
 from graspq.common.errors import UserError, refuse_other
 from graspq.common.files import read_json, write_json
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+READABLE = (1, 2)
 MANIFEST_NAME = "manifest.json"
 SHARD_NAME = re.compile(r"blocks-\d{6,}-\d{6,}(-short-\d+)?")
-DECIDING = ("task", "settings", "object_set", "discount", "versions")
+DECIDING = ("format_version", "task", "settings", "object_set", "discount", "versions")
 REMEDY = "copy the dataset again, or make it again with the command that made it"
 
 
@@ -98,6 +99,7 @@ class Manifest:
         phi_range: least and greatest unwrapped wrist angle φ, radians; None where a pose has none.
         shards: ordered by first block, disjoint.
         files: SHA-256 of the other files that belong to it, such as `README.md`.
+        format_version: that of its tables, see `columns`; new ones are of format 2.
         tells_action: whether the JSON holds `action`; a manifest that was read without it is written without it.
     """
 
@@ -195,10 +197,9 @@ class Manifest:
         values = read_json(path, "dataset manifest")
         if not isinstance(values, dict) or "format_version" not in values:
             raise UserError(f"{path}: not a dataset manifest; {REMEDY}")
-        if values["format_version"] != FORMAT_VERSION and values.get("digest") == _digest_of(values):
-            raise UserError(
-                f"{path}: format version {values['format_version']}, expected {FORMAT_VERSION}; use another graspq"
-            )
+        if values["format_version"] not in READABLE and values.get("digest") == _digest_of(values):
+            found, expected = values["format_version"], " or ".join(map(str, READABLE))
+            raise UserError(f"{path}: format version {found}, expected {expected}; use another graspq")
         return cls._checked(path, values)
 
     @classmethod

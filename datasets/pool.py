@@ -20,6 +20,7 @@ from graspq.datasets.batch import EpisodeBatch, TransitionBatch, gather_episodes
 from graspq.datasets.blocks import BlockArrays, BlockRef, read_block, read_columns, read_episode_rows
 from graspq.datasets.columns import RecordType, record_dtype
 from graspq.datasets.episode import Episode
+from graspq.datasets.images import decoded
 from graspq.datasets.loader import DEFAULT_BUFFER_BYTES, Gather, Loader, in_order
 from graspq.datasets.sampler import Sampler
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 View = Literal["transitions", "episodes"]
 # Attributes of an episode that the episodes table holds as they are.
-AS_THEY_ARE = ("episode_id", "block", "seed", "end", "success", "lifted_object", "policy", "exploration")
+AS_THEY_ARE = ("episode_id", "block", "seed", "ended_by", "success", "lifted_object", "policy", "exploration")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,23 +109,32 @@ class ShardPool:
         number %= self.episodes
         starts = np.cumsum([0, *(ref.episodes for ref in self.blocks)])
         index = int(np.searchsorted(starts, number, side="right")) - 1
-        ref, number = self.blocks[index], number - int(starts[index])
+        return self._block_episodes(self.blocks[index])[number - int(starts[index])]
+
+    def __iter__(self) -> Iterator[Episode]:
+        """Return the episodes in order; each block is read once."""
+        return (episode for ref in self.blocks for episode in self._block_episodes(ref))
+
+    def _block_episodes(self, ref: BlockRef) -> list[Episode]:
         block = self.read_block(ref)
-        rows = read_episode_rows(ref.path.parent.parent / "episodes" / ref.path.name)
-        row = [row for row in rows if row["block"] == ref.block][number]
-        first = int(block.first_rows[number])
-        steps = slice(first, first + int(block.lengths[number]))
-        records = block.records[steps]
-        return Episode(
-            images=block.images[steps].copy(),
-            actions=np.ascontiguousarray(records["action"]),
-            rewards=np.ascontiguousarray(records["reward"]),
-            gripper_poses=np.ascontiguousarray(records["gripper_pose"]),
-            object_ids=tuple(row["object_ids"]),
-            object_poses=np.array(row["object_poses"], np.float32).reshape(-1, 7),
-            final_pose=np.array(row["final_pose"], np.float32),
-            **{name: row[name] for name in AS_THEY_ARE},
-        )
+        rows = read_episode_rows(ref.path.parent.parent / "episodes" / ref.path.name, ref.block)
+        episodes = []
+        for row, first, length in zip(rows, block.first_rows.tolist(), block.lengths.tolist(), strict=True):
+            records, final = block.records[first : first + length], row.get("final_image")
+            episodes.append(
+                Episode(
+                    images=block.images[first : first + length].copy(),
+                    actions=np.ascontiguousarray(records["action"]),
+                    rewards=np.ascontiguousarray(records["reward"]),
+                    gripper_poses=np.ascontiguousarray(records["gripper_pose"]),
+                    object_ids=tuple(row["object_ids"]),
+                    object_poses=np.array(row["object_poses"], np.float32).reshape(-1, 7),
+                    final_pose=np.array(row["final_pose"], np.float32),
+                    final_image=None if final is None else decoded(final, self.image_shape).copy(),
+                    **{name: row[name] for name in AS_THEY_ARE},
+                )
+            )
+        return episodes
 
     def read_block(self, ref: BlockRef) -> BlockArrays:
         """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""

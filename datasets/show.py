@@ -111,7 +111,7 @@ def _header(figure: Figure, episode: Episode, left: float, line: float) -> None:
     outcome = "success" if episode.success else "failure"
     lifted = f"lifted {episode.lifted_object}" if episode.lifted_object is not None else "nothing lifted"
     steps = counted(episode.steps, "step")
-    text = f"{outcome} · episode {episode.episode_id} · {steps}, ended by {episode.end} · {lifted}"
+    text = f"{outcome} · episode {episode.episode_id} · {steps}, ended by {episode.ended_by} · {lifted}"
     figure.text(left, line, text, fontsize=8, color=_color(episode), weight="bold", va="center")
 
 

@@ -1,7 +1,4 @@
-"""Episodes to Arrow tables and back to numpy, and the Parquet settings: a row per step, a row per episode.
-
-The image column is raw RGB: with zstd that is smaller than PNG and decodes ten times as fast (DESIGN, section 3).
-"""
+"""Episodes to Arrow tables and back to numpy, and the Parquet settings: a row per step, a row per episode."""
 
 import json
 from collections.abc import Sequence
@@ -10,7 +7,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from graspq.datasets import columns
+from graspq.datasets import columns, images
 from graspq.datasets.columns import Column, sizes_of
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import Manifest
@@ -47,7 +44,7 @@ def parquet_settings(schema: pa.Schema) -> dict[str, Any]:
 def steps_table(manifest: Manifest, episodes: Sequence[Episode]) -> pa.Table:
     """Return the steps of `episodes`, in their order, with labels; columns as in `steps_schema`."""
     schema = steps_schema(manifest)
-    values = [columns.step_values(episode, columns.episode_row(episode), manifest) for episode in episodes]
+    values = [columns.step_values(episode, manifest) for episode in episodes]
     arrays = [
         _array(np.concatenate([value[name] for value in values]), schema.field(name).type) for name in schema.names
     ]
@@ -56,21 +53,21 @@ def steps_table(manifest: Manifest, episodes: Sequence[Episode]) -> pa.Table:
 
 def episodes_table(manifest: Manifest, episodes: Sequence[Episode]) -> pa.Table:
     """Return one row per episode; columns as in `episodes_schema`."""
-    return pa.Table.from_pylist(
-        [columns.episode_row(episode) for episode in episodes], schema=episodes_schema(manifest)
-    )
+    rows = [columns.episode_row(episode, manifest.format_version) for episode in episodes]
+    return pa.Table.from_pylist(rows, schema=episodes_schema(manifest))
 
 
 def _schema(manifest: Manifest, table: str, described: Sequence[Column]) -> pa.Schema:
     sizes = sizes_of(manifest.image_shape, manifest.action)
     fields = [
         pa.field(
-            column.name,
-            column.arrow_type(sizes),
+            column.stored_name(manifest.format_version),
+            column.arrow_type(sizes, manifest.format_version),
             nullable=column.nullable,
             metadata={key: json.dumps(value) for key, value in column.metadata(manifest).items()} or None,
         )
         for column in described
+        if column.since <= manifest.format_version
     ]
     facts = {
         "image_shape": list(manifest.image_shape),
@@ -88,16 +85,11 @@ def _schema(manifest: Manifest, table: str, described: Sequence[Column]) -> pa.S
 
 
 def to_numpy(column: pa.ChunkedArray) -> Any:
-    """Return a column as numpy: [N], or [N, ...] for arrays and images; a view wherever Arrow allows one."""
-    return _numpy(column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks))
+    """Return a column of numbers as numpy, [N] or [N, ...]; a view wherever Arrow allows one."""
+    return _numpy(images.only(column))
 
 
 def _numpy(array: pa.Array) -> Any:
-    if pa.types.is_fixed_size_binary(array.type):
-        width = array.type.byte_width
-        flat = np.frombuffer(array.buffers()[1], np.uint8, len(array) * width, array.offset * width)
-        flat.flags.writeable = False
-        return flat.reshape(len(array), width)
     if pa.types.is_fixed_size_list(array.type):
         inner = _numpy(array.flatten())
         return inner.reshape(len(array), array.type.list_size, *inner.shape[1:])
@@ -105,9 +97,8 @@ def _numpy(array: pa.Array) -> Any:
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
-    """Return rows as an Arrow array; images are taken as they lie in memory."""
-    if pa.types.is_fixed_size_binary(kind):
-        return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
+    if pa.types.is_binary(kind) or pa.types.is_fixed_size_binary(kind):
+        return images.to_arrow(values, kind)
     if pa.types.is_fixed_size_list(kind):
         inner = np.ascontiguousarray(values).reshape(-1, *values.shape[2:])
         return pa.FixedSizeListArray.from_arrays(_array(inner, kind.value_type), type=kind)

@@ -17,6 +17,7 @@ from graspq.common.files import LOCK_NAME, read_json, sha256_of
 from graspq.datasets.blocks import BlockRef, read_block
 from graspq.datasets.columns import record_dtype, wrong_labels
 from graspq.datasets.dataset import Shard
+from graspq.datasets.images import decoded
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from graspq.datasets.tables import episodes_schema, steps_schema
 from graspq.engine import EngineSettings, Place, run
@@ -190,6 +191,9 @@ def _block(manifest: Manifest, ref: BlockRef, episodes: list[dict[str, Any]]) ->
     if arrays.lengths.tolist() != [row["steps"] for row in episodes]:
         yield "the lengths of its episodes are not those of the episodes table"
         return
+    for row in episodes:
+        if "final_image" in row:
+            decoded(row["final_image"], manifest.image_shape)
     for row, first, length in zip(episodes, arrays.first_rows.tolist(), arrays.lengths.tolist(), strict=True):
         records = arrays.records[first : first + length]
         steps = {name: records[name] for name in records.dtype.names or ()}

@@ -94,6 +94,8 @@ def _grouped(manifest: Manifest, first_block: int, blocks: int, episodes: Sequen
     ids = [episode.episode_id for episode in episodes]
     if ids != list(range(ids[0], ids[0] + len(ids))):
         raise ValueError("episode_id: expected consecutive numbers")
+    if manifest.format_version > 1 and any(episode.final_image is None for episode in episodes):
+        raise ValueError("final_image: expected one in every episode")
     wrong = next((episode for episode in episodes if episode.images.shape[1:] != manifest.image_shape), None)
     if wrong is not None:
         raise ValueError(f"images: expected {manifest.image_shape}, got {wrong.images.shape[1:]}")

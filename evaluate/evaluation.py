@@ -227,7 +227,7 @@ def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "ci95": list(wilson_interval(successes, len(rows))),
         "mean_steps": float(np.mean([row.steps for row in rows])),
         "mean_return": float(np.mean([row.episode_return for row in rows])),
-        "ends": {end: sum(row.end == end for row in rows) for end in ("height", "T")},
+        "ends": {end: sum(row.ended_by == end for row in rows) for end in ("height", "T")},
         "policy": job.policy or (CEM if search is not None else ACTOR),
         "run": job.run.as_posix() if job.run is not None else None,
         "algo": run.origin.algo if run is not None else None,

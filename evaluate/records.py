@@ -17,7 +17,7 @@ from graspq.common.files import read_json, sha256_of, write_json, write_text
 EVAL_FILE = "eval.json"
 EPISODES_FILE = "episodes.jsonl"
 FILMS_FILE = "films.npz"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 # What eval.json calls policies: the two ends of the scale, and those of runs.
 ORACLE, RANDOM, CEM, ACTOR = "oracle", "random", "cem", "actor"
 
@@ -33,7 +33,7 @@ class EpisodeRow:
         success: whether the grasp counted.
         lifted_object: the object that was lifted; None if none was.
         steps: number of actions, 1 .. T.
-        end: `"height"` (the gripper came below the threshold) or `"T"` (the last step).
+        ended_by: `"height"` (the gripper came below the threshold) or `"T"` (the last step).
         episode_return: sum of rewards, undiscounted.
         q: Q-value of the last action, a probability of success; None where the policy has no Q-function.
     """
@@ -44,7 +44,7 @@ class EpisodeRow:
     success: bool
     lifted_object: str | None
     steps: int
-    end: str
+    ended_by: str
     episode_return: float
     q: float | None
 
@@ -57,7 +57,7 @@ class EpisodeRow:
             "success": self.success,
             "lifted_object": self.lifted_object,
             "steps": self.steps,
-            "end": self.end,
+            "ended_by": self.ended_by,
             "return": self.episode_return,
             "q": self.q,
         }

@@ -68,7 +68,7 @@ class Rollouts:
             success=played.success,
             lifted_object=played.lifted_object,
             steps=len(played.actions),
-            end=played.end,
+            ended_by=played.ended_by,
             episode_return=float(played.rewards.sum()),
             q=played.q,
         )

@@ -28,7 +28,7 @@ def film_groups(findings: Findings) -> list[dict[str, Any]]:
 def _film(film: Film) -> dict[str, Any]:
     row = film.row
     what = f"lifted {row.lifted_object}" if row.lifted_object is not None else "lifted nothing"
-    where = "near the floor" if row.end == "height" else "at the last step"
+    where = "near the floor" if row.ended_by == "height" else "at the last step"
     q = f", Q {row.q:.2f}" if row.q is not None else ""
     frames = []
     for index, frame in enumerate(film.frames):

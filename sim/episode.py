@@ -39,11 +39,11 @@ class Outcome:
     """What an action led to.
 
     Attributes:
-        observation: after the action; after the last one, of the gripper closed and lifted, if rendered at all.
+        observation: after the action; after the last one, of the gripper closed and lifted.
         reward: 1.0 for a successful grasp at the last step, else 0.0.
         terminated: whether the episode has ended.
-        info: at the end `end` ("height" or "T"), `success`, `lifted_object` (id or None), `final_pose` (float32 [4],
-            after the last action and before the scripted descent); empty before.
+        info: at the end `ended_by` ("height" or "T"), `success`, `lifted_object` (id or None), `final_pose`
+            (float32 [4], after the last action and before the scripted descent); empty before.
     """
 
     observation: Observation
@@ -134,12 +134,11 @@ class GraspSimulation:
         poses = [[*position, *orientation] for position, orientation in (body.pose() for body in self.bodies)]
         return np.asarray(poses, dtype=np.float32).reshape(len(self.bodies), 7)
 
-    def step(self, action: Sequence[float] | np.ndarray, *, observe_end: bool = True) -> Outcome:
+    def step(self, action: Sequence[float] | np.ndarray) -> Outcome:
         """Apply one action.
 
         Args:
             action: [A] in units of the limits of the task's actions, clipped to [-1, 1].
-            observe_end: render the frame after the lift (collection has no use for it).
 
         Raises:
             RuntimeError: the episode has ended.
@@ -154,7 +153,7 @@ class GraspSimulation:
         commanded = np.clip(pose, *settings.workspace_bounds)
         self._move(commanded, settings.steps_per_action - _HOLD_STEPS, hold=_HOLD_STEPS)
         self.step_count += 1
-        previous, self._observation = self._observation, None
+        self._observation = None
         low = bool(self.arm.commanded[2] < settings.trigger_height)
         if not low and self.step_count < settings.max_steps:
             return Outcome(self.observation, 0.0, False, {})
@@ -163,13 +162,12 @@ class GraspSimulation:
         lifted = self._close_and_lift(descend=low)
         rewarded = self.task.rewarded(self.objects, lifted)
         info = {
-            "end": "height" if low else "T",
+            "ended_by": "height" if low else "T",
             "success": rewarded is not None,
             "lifted_object": rewarded if rewarded is not None else next(iter(lifted), None),
             "final_pose": final_pose,
         }
-        last = self.observation if observe_end or previous is None else previous
-        return Outcome(last, float(rewarded is not None), True, info)
+        return Outcome(self.observation, float(rewarded is not None), True, info)
 
     def _move(self, pose: np.ndarray, steps: int, hold: int) -> None:
         """Move the arm: at once where it meets nothing on its way and all objects rest, else by simulation."""

@@ -42,8 +42,8 @@ class Played:
         observations: T of them, before each action.
         actions: float32 [T, A].
         rewards: float32 [T]; 0 but for the last.
-        last: the frame after the lift, uint8 [H, W, C], if it was asked for; else that before the last action.
-        end: "height" (the gripper came below its trigger height) or "T" (the last step).
+        last: the frame after the lift, uint8 [H, W, C].
+        ended_by: "height" (the gripper came below its trigger height) or "T" (the last step).
         success: whether the grasp counted.
         lifted_object: id of the object that was lifted; None if none was.
         final_pose: float32 [A], measured after the last action and before the scripted descent.
@@ -55,7 +55,7 @@ class Played:
     actions: np.ndarray
     rewards: np.ndarray
     last: np.ndarray
-    end: Literal["height", "T"]
+    ended_by: Literal["height", "T"]
     success: bool
     lifted_object: str | None
     final_pose: np.ndarray
@@ -67,16 +67,13 @@ class Played:
         return np.stack([*(observation.image for observation in self.observations), self.last])
 
 
-def play(
-    simulation: "GraspSimulation", policy: Policy, rng: np.random.Generator, *, observe_end: bool = True
-) -> Played:
+def play(simulation: "GraspSimulation", policy: Policy, rng: np.random.Generator) -> Played:
     """Play an episode that `simulation.reset` has just started to its end.
 
     Args:
         simulation: at the start of an episode.
         policy: who acts.
         rng: the policy's noise.
-        observe_end: render the frame after the lift (collection has no use for it).
 
     Raises:
         RuntimeError: no episode was started.
@@ -89,7 +86,7 @@ def play(
     observation, terminated = simulation.observation, False
     while not terminated:
         action = policy.act(observation, rng)
-        outcome = simulation.step(action, observe_end=observe_end)
+        outcome = simulation.step(action)
         observations.append(observation)
         actions.append(action)
         rewards.append(outcome.reward)
@@ -101,7 +98,7 @@ def play(
         actions=np.stack(actions).astype(np.float32, copy=False),
         rewards=np.asarray(rewards, dtype=np.float32),
         last=observation.image,
-        end=outcome.info["end"],
+        ended_by=outcome.info["ended_by"],
         success=outcome.info["success"],
         lifted_object=outcome.info["lifted_object"],
         final_pose=outcome.info["final_pose"],

@@ -15,11 +15,12 @@ SETTINGS = CollectionSettings(seed=4, block_size=6)
 def same(first, second):
     for ours, theirs in zip(first, second, strict=True):
         np.testing.assert_array_equal(ours.images, theirs.images)
+        np.testing.assert_array_equal(ours.final_image, theirs.final_image)
         np.testing.assert_array_equal(ours.actions, theirs.actions)
         np.testing.assert_array_equal(ours.gripper_poses, theirs.gripper_poses)
         np.testing.assert_array_equal(ours.object_poses, theirs.object_poses)
         np.testing.assert_array_equal(ours.rewards, theirs.rewards)
-        assert (ours.seed, ours.object_ids, ours.end) == (theirs.seed, theirs.object_ids, theirs.end)
+        assert (ours.seed, ours.object_ids, ours.ended_by) == (theirs.seed, theirs.object_ids, theirs.ended_by)
     return True
 
 

@@ -10,7 +10,7 @@ from graspq.common.files import sha256_of, write_json, write_text
 from graspq.common.seeding import generator
 from graspq.datasets.card import write_card
 from graspq.datasets.episode import Episode
-from graspq.datasets.manifest import Manifest
+from graspq.datasets.manifest import FORMAT_VERSION, Manifest
 from graspq.datasets.writer import commit_shard, write_shard
 
 LIMITS = (0.06, 0.06, 0.05, 0.7)
@@ -33,6 +33,7 @@ def make_manifest(
     discount: float = 1.0,
     task: str = "regular",
     action: ActionSpace | None = None,
+    format_version: int = FORMAT_VERSION,
 ) -> Manifest:
     return Manifest(
         task={"name": task, "max_steps": 15},
@@ -43,6 +44,7 @@ def make_manifest(
         action=grasping(LIMITS) if action is None else action,
         discount=discount,
         phi_range=(-2.9, 2.9) if action is None else None,
+        format_version=format_version,
     )
 
 
@@ -50,8 +52,8 @@ def make_episode(index: int, block_size: int = 2, size: int = 8, parts: int = 4)
     rng = generator("tests/episode", index)
     steps = int(rng.integers(1, 9))
     y, x = np.mgrid[0:size, 0:size]
-    images = np.empty((steps, size, size, 3), np.uint8)
-    for step in range(steps):
+    images = np.empty((steps + 1, size, size, 3), np.uint8)
+    for step in range(steps + 1):
         images[step] = np.stack([x * 5 + index, y * 7 + step * 11, (x + y) * 3], -1) % 256
         images[step, rng.integers(size), rng.integers(size)] = rng.integers(256, size=3)
         images[step, 0, 0] = (index % 256, index // 256, step)
@@ -65,16 +67,17 @@ def make_episode(index: int, block_size: int = 2, size: int = 8, parts: int = 4)
         seed=int(rng.integers(2**62)),
         object_ids=("train_001", f"train_{index:03d}"),
         object_poses=rng.normal(size=(2, 7)).astype(np.float32),
-        images=images,
+        images=images[:-1],
         actions=rng.uniform(-1, 1, (steps, parts)).astype(np.float32),
         rewards=rewards,
         gripper_poses=poses[:-1],
         final_pose=poses[-1],
-        end="T" if steps == 8 else "height",
+        ended_by="T" if steps == 8 else "height",
         success=success,
         lifted_object="train_001" if success else None,
         policy="random",
         exploration=0.9,
+        final_image=images[-1],
     )
 
 
@@ -91,9 +94,10 @@ def make_dataset(
     size: int = 8,
     discount: float = 1.0,
     action: ActionSpace | None = None,
+    format_version: int = FORMAT_VERSION,
 ) -> Manifest:
     """Write a dataset of real shards, with an object set and a card, and return its manifest."""
-    manifest = make_manifest(size, block_size, discount, action=action)
+    manifest = make_manifest(size, block_size, discount, action=action, format_version=format_version)
     manifest = dataclasses.replace(manifest, object_set=make_objects(folder))
     for first in range(0, blocks, per_shard):
         count = min(per_shard, blocks - first)

@@ -4,6 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import datasets as hugging_face
 from graspq.datasets.card import card_text
 from graspq.datasets.columns import EPISODES, STEPS
 from graspq.datasets.manifest import Manifest
@@ -39,6 +40,8 @@ def test_the_header_declares_the_columns_of_the_schemas(dataset, header):
     manifest = Manifest.load(dataset)
     declared = [line.removeprefix("  - name: ") for line in header if line.startswith("  - name: ")]
     assert declared == steps_schema(manifest).names + episodes_schema(manifest).names
+    for name in ("image", "final_image"):
+        assert header[header.index(f"  - name: {name}") + 1] == "    dtype: image"
     start = header.index("  - name: action")
     assert header[start + 1 : start + 3] == ["    list: float32", "    length: 4"]
     start = header.index("  - name: object_poses")
@@ -55,3 +58,22 @@ def test_the_size_category_follows_the_rows(dataset, rows, category):
 def test_every_column_is_described(dataset):
     text = card_text(Manifest.load(dataset)).split("---\n")[2]
     assert [column.name for column in (*STEPS, *EPISODES) if f"| `{column.name}` |" not in text] == []
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_hugging_face_datasets_reads_both_tables_with_images(dataset, drawn, tmp_path, streaming):
+    def read(table):
+        options = {"split": "train", "streaming": streaming, "cache_dir": str(tmp_path)}
+        return hugging_face.load_dataset(str(dataset), table, **options)
+
+    episodes = drawn.episodes(0, 12)
+    images = np.concatenate([episode.images for episode in episodes])
+    steps, attempts = read("steps"), read("episodes")
+    assert np.array_equal(np.stack([np.asarray(step["image"]) for step in steps]), images)
+    rows = list(attempts)
+    finals = np.stack([np.asarray(row["final_image"]) for row in rows])
+    assert np.array_equal(finals, np.stack([episode.final_image for episode in episodes]))
+    assert [row["ended_by"] for row in rows] == [episode.ended_by for episode in episodes]
+    tensors = next(iter(steps.with_format("torch")))
+    assert np.array_equal(tensors["image"].numpy().transpose(1, 2, 0), images[0])
+    assert np.array_equal(tensors["action"].numpy(), episodes[0].actions[0])

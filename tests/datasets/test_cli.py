@@ -19,6 +19,7 @@ def test_info_prints_what_the_manifest_says(dataset, many_blocks):
     lines = {line[:17].strip(): line[17:].split("  ") for line in result.output.splitlines()}
     manifest = Manifest.load(dataset)
     for name, value in {
+        "format": "2",
         "task": "regular",
         "episodes": "24",
         "rows": str(manifest.rows),

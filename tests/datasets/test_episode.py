@@ -13,7 +13,8 @@ def test_an_episode_with_a_wrong_shape_dtype_or_name_is_refused(drawn):
         "final_pose": episode.final_pose[:3],
         "object_poses": episode.object_poses[:1],
         "gripper_poses": np.full_like(episode.gripper_poses, np.nan),
-        "end": "truncated",
+        "ended_by": "truncated",
+        "final_image": episode.final_image[:4],
         "seed": -1,
     }
     for name, value in wrong.items():

@@ -46,7 +46,7 @@ def test_a_folder_that_is_no_dataset_gives_one_line_that_names_it(tmp_path):
 
 def test_another_format_version_is_named(drawn, tmp_path):
     dataclasses.replace(drawn.manifest(), format_version=99).save(tmp_path)
-    with pytest.raises(UserError, match="format version 99, expected 1"):
+    with pytest.raises(UserError, match="format version 99, expected 1 or 2"):
         Manifest.load(tmp_path)
 
 

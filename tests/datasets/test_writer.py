@@ -13,6 +13,7 @@ import pytest
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
 from graspq.datasets.dataset import Shard, open_shards
+from graspq.datasets.images import decoded
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.verify import verify
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
@@ -36,11 +37,12 @@ def test_what_is_read_is_what_was_written(dataset, drawn):
             assert np.array_equal(arrays.records["gripper_pose"][span], episode.gripper_poses)
             assert arrays.records["terminal"][span].tolist() == [False] * (episode.steps - 1) + [True]
             row = rows[episode.episode_id]
-            for name in ("episode_id", "block", "seed", "steps", "end", "success", "lifted_object", "exploration"):
+            for name in ("episode_id", "block", "seed", "steps", "ended_by", "success", "lifted_object", "exploration"):
                 assert row[name] == getattr(episode, name)
             assert tuple(row["object_ids"]) == episode.object_ids
             assert np.array_equal(np.float32(row["object_poses"]), episode.object_poses)
             assert np.array_equal(np.float32(row["final_pose"]), episode.final_pose)
+            assert np.array_equal(decoded(row["final_image"], (8, 8, 3)), episode.final_image)
 
 
 def test_the_same_episodes_give_the_same_bytes(new_dataset):
@@ -83,6 +85,12 @@ def test_episodes_that_are_not_those_of_the_blocks_are_refused(drawn, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_episode_of_format_2_needs_its_final_image(drawn, tmp_path):
+    episodes = [dataclasses.replace(episode, final_image=None) for episode in drawn.episodes(0, 1)]
+    with pytest.raises(ValueError, match="final_image: expected one in every episode"):
+        write_shard(tmp_path, drawn.manifest(), 0, 1, episodes)
+
+
 def test_a_full_disk_gives_one_line_with_folder_and_bytes_and_leaves_nothing(drawn, tmp_path):
     (tmp_path / "shards").mkdir()
     # Every write to /dev/full fails with ENOSPC: the real error, without a full disk.
@@ -102,6 +110,7 @@ from pathlib import Path
 spec = importlib.util.spec_from_file_location("helpers", sys.argv[1])
 helpers = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(helpers)
+from graspq.datasets.images import decoded
 from graspq.datasets.manifest import Manifest
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
 folder = Path(sys.argv[2])

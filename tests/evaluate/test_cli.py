@@ -191,7 +191,7 @@ def test_a_users_policy_is_scored_and_filmed_by_the_same_command(
     )  # fmt: skip
     assert done.code == 0, done.err
     (row,) = Evaluation.load(Path("runs/baselines/straight_down.make-regular-train-seed0-1")).rows()
-    assert (row.steps, row.end) == (4, "height")
+    assert (row.steps, row.ended_by) == (4, "height")
     assert all(name.startswith("train_") for name in row.object_ids)
     frames = np.stack([frame[..., :3] for frame in imageio.mimread(tmp_path / "down.gif")])
     assert len(frames) > 20 and frames.shape[1:] == (64, 64, 3)

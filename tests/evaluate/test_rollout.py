@@ -48,7 +48,7 @@ def test_rows_say_what_happened(at_random: Result) -> None:
         assert (row.episode, row.seed, row.q) == (episode, 0, None)
         assert len(set(row.object_ids)) == 5 and all(name.startswith("test_") for name in row.object_ids)
         assert row.success == (row.lifted_object is not None) == (row.episode_return == 1.0)
-        assert row.end in ("height", "T") and 1 <= row.steps <= 15
+        assert row.ended_by in ("height", "T") and 1 <= row.steps <= 15
         assert films[episode].frames.shape == (row.steps + 1, 64, 64, 3)
         assert films[episode].frames.std() > 10
 

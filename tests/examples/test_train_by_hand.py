@@ -28,11 +28,12 @@ def bright_is_success(number):
         rewards=np.array([0, success], np.float32),
         gripper_poses=np.zeros((2, 4), np.float32),
         final_pose=np.zeros(4, np.float32),
-        end="height",
+        ended_by="height",
         success=success,
         lifted_object="train_001" if success else None,
         policy="random",
         exploration=1.0,
+        final_image=np.zeros((16, 16, 3), np.uint8),
     )
 
 

@@ -16,7 +16,7 @@ def successes(task, objects, episodes):
             rng = np.random.default_rng(episode)
             simulation.load(task.draw(objects, "train", rng))
             simulation.reset(rng)
-            won += play(simulation, oracle, rng, observe_end=False).success
+            won += play(simulation, oracle, rng).success
     return won
 
 

@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 import graspq  # noqa: F401  (registers the environments)
 from graspq.common.errors import UserError
+from graspq.datasets.images import decoded
 from graspq.sim.observation import ARM, STILL
 
 NAMES = {"regular": "graspq/RegularGrasping-v0", "targeted": "graspq/TargetedGrasping-v0"}
@@ -101,7 +102,7 @@ def test_the_scene_of_a_dataset_is_laid_again_and_the_recorded_actions_lead_to_t
     for row, steps in zip(rows, episodes, strict=True):
         observation, _ = environment.reset(options={"scene": row})
         for step in steps:
-            image = np.frombuffer(step["image"], np.uint8).reshape(64, 64, 3)
+            image = decoded(step["image"], (64, 64, 3))
             # Contacts before the objects came to rest are not recorded: what the gripper moves ends a little elsewhere.
             assert (observation["image"] != image).any(axis=-1).mean() <= (0.05 if observation["step"] else 0)
             observation, reward, terminated, *_ = environment.step(np.array(step["action"], np.float32))

@@ -35,7 +35,7 @@ def test_going_below_the_trigger_height_ends_the_episode(simulation):
     simulation.reset(np.random.default_rng(0))
     outcomes = [simulation.step([0, 0, -1, 0]) for _ in range(4)]
     assert [outcome.terminated for outcome in outcomes] == [False, False, False, True]
-    assert outcomes[-1].info["end"] == "height"
+    assert outcomes[-1].info["ended_by"] == "height"
     assert outcomes[-1].info["final_pose"][2] == pytest.approx(0.04, abs=0.004)
 
 
@@ -43,7 +43,7 @@ def test_the_gripper_closes_where_it_is_after_fifteen_actions(simulation):
     simulation.reset(np.random.default_rng(0))
     outcomes = [simulation.step([0, 0, 0.5, 0]) for _ in range(15)]
     assert [outcome.terminated for outcome in outcomes] == [False] * 14 + [True]
-    assert outcomes[-1].info["end"] == "T"
+    assert outcomes[-1].info["ended_by"] == "T"
     assert outcomes[-1].reward == 0.0
     assert outcomes[-1].info["final_pose"][2] == pytest.approx(TASK.settings.home_height, abs=0.002)
     with pytest.raises(RuntimeError, match="call reset first"):

@@ -35,7 +35,7 @@ def test_an_episode_is_played_to_its_end_and_all_of_it_is_kept(simulation):
     simulation.reset(np.random.default_rng(0))
     poses, watcher = simulation.object_poses(), Watcher()
     played = play(simulation, watcher, np.random.default_rng(1))
-    assert (watcher.begun, played.end, played.q) == ([0], "height", 0.5)
+    assert (watcher.begun, played.ended_by, played.q) == ([0], "height", 0.5)
     assert [observation.step for observation in watcher.seen] == list(range(6))
     assert played.observations == tuple(watcher.seen)
     np.testing.assert_array_equal(played.object_poses, poses)
@@ -45,15 +45,15 @@ def test_an_episode_is_played_to_its_end_and_all_of_it_is_kept(simulation):
     assert (played.frames[-1] != played.frames[-2]).any(), "the view after the lift"
 
 
-def test_what_is_watched_or_rendered_at_the_end_changes_nothing(simulation):
-    def outcome(**choices):
+def test_what_is_watched_changes_nothing(simulation):
+    def outcome():
         simulation.load(simulation.object_ids)
         simulation.reset(np.random.default_rng(3))
-        played = play(simulation, RandomPolicy(), np.random.default_rng(4), **choices)
+        played = play(simulation, RandomPolicy(), np.random.default_rng(4))
         return played.actions.tobytes(), played.final_pose.tobytes(), simulation.object_poses().tobytes()
 
     count = []
-    plain = outcome(observe_end=False)
+    plain = outcome()
     with simulation.world.watched(lambda: count.append(simulation.render(8).mean())):
         assert outcome() == plain
     assert len(count) > 100

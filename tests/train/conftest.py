@@ -50,11 +50,12 @@ def make_episode(index: int, parts: int = 4) -> Episode:
         rewards=rewards,
         gripper_poses=poses[:-1],
         final_pose=poses[-1],
-        end="height",
+        ended_by="height",
         success=success,
         lifted_object="train_001" if success else None,
         policy="random",
         exploration=1.0,
+        final_image=images[-1],
     )
 
 
