@@ -24,7 +24,11 @@ class EvalSettings(CemOptions, EngineSettings):
         help="Task: regular, targeted or module:task. Default: the run's own; without a run that of the runs beside, "
         "else regular.",
     )
-    split: str = setting("test", help="Split of the object set; test-clutter for unseen distractors (targeted).")
+    split: str = setting(
+        "test",
+        help="Split of the object set, such as test, or validation to choose by; test-clutter for unseen distractors "
+        "(targeted).",
+    )
     episodes: int = setting(1000, help="Episodes (grasps) of each job, such as 200 or 1k.", parse=parse_count)
     seed: int = setting(0, help="Seed of the scenes: the same seed gives every policy the same scenes.", minimum=0)
     objects: Path | None = setting(

@@ -19,7 +19,7 @@ class LightSettings(TaskSettings):
 
     objects_per_bin: int = 3
     max_steps: int = 8
-    heaviest: float = 0.022  # kilograms that still count as light
+    heaviest: float = 0.05  # kilograms that still count as light
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from graspq.common.options import Group, Settings, options_from, setting, with_version
 from graspq.objects.object_set import ObjectSet
-from graspq.objects.procedural import make_procedural
+from graspq.objects.procedural import COUNTS, SEED, make_procedural
+from graspq.objects.shapes import FAMILIES
 from graspq.objects.show import contact_sheet
 from graspq.objects.targeted import make_targeted
 from graspq.objects.third_party import LARGEST, SMALLEST, import_meshes
@@ -23,9 +24,17 @@ class ProceduralSettings(Settings):
     """Options of `make procedural`."""
 
     folder: Path = setting(help="Folder of the set.", positional=True, metavar="FOLDER")
-    seed: int = setting(0, help="Seed of all shapes, masses and colours; a whole number of at least 0.", minimum=0)
-    train: int = setting(900, help="Number of objects to train on, at least 1.", minimum=1)
-    test: int = setting(100, help="Number of held-out objects, at least 1.", minimum=1)
+    seed: int = setting(SEED, help="Seed of all shapes, masses and colours; a whole number of at least 0.", minimum=0)
+    train: int = setting(COUNTS["train"], help="Number of objects to train on, at least 1.", minimum=1)
+    test: int = setting(COUNTS["test"], help="Number of held-out objects, at least 1.", minimum=1)
+    validation: int = setting(
+        COUNTS["validation"], help="Number of held-out objects to choose networks and settings by.", minimum=0
+    )
+    held_out_family: tuple[str, ...] = setting(
+        (),
+        help="Family that train and validation have no part of; test is of such families alone. May be repeated. One "
+        f"of {', '.join(FAMILIES)}.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +42,7 @@ class TargetedSettings(Settings):
     """Options of `make targeted`."""
 
     folder: Path = setting(help="Folder of the set.", positional=True, metavar="FOLDER")
-    seed: int = setting(0, help="Seed of the distractors' shapes; a whole number of at least 0.", minimum=0)
+    seed: int = setting(SEED, help="Seed of the distractors' shapes; a whole number of at least 0.", minimum=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +66,9 @@ class ShowSettings(Settings):
     out: Path = setting(help="The picture to write, a .png file.")
     split: str | None = setting(None, help="Only objects of this split, such as train or test.")
     count: int = setting(40, help="At most so many objects, the first of the set; at least 1.", minimum=1)
+    by_family: int = setting(
+        0, help="Instead the first so many objects of each main family, family by family.", minimum=0
+    )
 
 
 @click.group(cls=Group)
@@ -73,16 +85,23 @@ def make() -> None:
 @make.command("procedural")
 @options_from(ProceduralSettings)
 def procedural(settings: ProceduralSettings) -> None:
-    """Make random rigid objects, unions of convex parts from eight families, split into train and test."""
+    """Make random rigid objects, unions of convex parts from sixteen families, in train, test and validation."""
     there = _is_there(settings.folder)
-    made = make_procedural(settings.folder, seed=settings.seed, train=settings.train, test=settings.test)
+    made = make_procedural(
+        settings.folder,
+        seed=settings.seed,
+        train=settings.train,
+        test=settings.test,
+        validation=settings.validation,
+        held_out=settings.held_out_family,
+    )
     _report(made, there)
 
 
 @make.command("targeted")
 @options_from(TargetedSettings)
 def targeted(settings: TargetedSettings) -> None:
-    """Make the set of the targeted task: a purple cross, four fixed and four unseen distractors."""
+    """Make the set of the targeted task: a purple cross, four fixed distractors, twice four unseen ones."""
     there = _is_there(settings.folder)
     _report(make_targeted(settings.folder, seed=settings.seed), there)
 
@@ -110,7 +129,10 @@ def import_(settings: ImportSettings) -> None:
 @options_from(ShowSettings)
 def show(settings: ShowSettings) -> None:
     """Draw a labelled contact sheet (PNG) of an object set."""
-    shown = contact_sheet(ObjectSet.load(settings.folder), settings.out, split=settings.split, count=settings.count)
+    object_set = ObjectSet.load(settings.folder)
+    shown = contact_sheet(
+        object_set, settings.out, split=settings.split, count=settings.count, by_family=settings.by_family
+    )
     click.echo(f"{settings.out}: {shown} objects")
 
 

@@ -10,10 +10,9 @@ import click
 from graspq.common.errors import UserError
 from graspq.common.files import cache_folder
 from graspq.objects.object_set import ObjectSet
-from graspq.objects.procedural import GENERATOR_VERSION, make_procedural
+from graspq.objects.procedural import GENERATOR_VERSION, SEED, make_procedural
 from graspq.objects.targeted import make_targeted
 
-SEED = 0
 _MAKERS: dict[str, Callable[[Path], ObjectSet]] = {
     "regular": lambda folder: make_procedural(folder, seed=SEED),
     "targeted": lambda folder: make_targeted(folder, seed=SEED),
@@ -21,7 +20,7 @@ _MAKERS: dict[str, Callable[[Path], ObjectSet]] = {
 
 
 def default_object_set(name: str) -> ObjectSet:
-    """Return the project's own set of a task, "regular" (1,000 objects) or "targeted" (9).
+    """Return the project's own set of a task, "regular" (1,100 objects) or "targeted" (13).
 
     It lies in the user's cache, in a folder named by the set and the version of the rules that made it. A folder that
     holds anything else, such as a set of older rules, is replaced. The first use of "regular" takes half a minute.

@@ -16,9 +16,6 @@ from graspq.objects.geometry import Array, principal_axes, union_mass_properties
 # 0.1 micrometre: what an OBJ file keeps of a coordinate.
 COORDINATE_DECIMALS = 7
 Color = tuple[float, float, float, float]
-# Hues (shares of the colour circle) that look evenly spaced, from pink over red, yellow, green and teal to blue.
-# Purple, 0.64 to 0.92, is left out: it is reserved for the target of the targeted task.
-_HUES = (0.92, 0.96, 1.0, 1.06, 1.13, 1.22, 1.35, 1.47, 1.54, 1.59, 1.64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +53,7 @@ class Solid:
 
     @classmethod
     def of(cls, parts: Sequence[trimesh.Trimesh]) -> "Solid":
-        """Move convex parts into the body frame of their union.
-
-        Raises:
-            UserError: too many parts lie inside each other; see `union_mass_properties`.
-        """
+        """Move convex parts into the body frame of their union."""
         properties = union_mass_properties(parts)
         moments, axes = principal_axes(properties.inertia)
         # On a grid, so that a last-bit difference between machines cannot reach the vertices.
@@ -110,8 +103,7 @@ def _significant(value: float) -> float:
 
 
 def draw_color(rng: np.random.Generator) -> Color:
-    """Draw a bright colour that is not purple: saturation 0.55 to 0.95, value 0.75 to 1."""
-    steps = len(_HUES) - 1
-    hue = float(np.interp(rng.uniform(0, steps), range(len(_HUES)), _HUES)) % 1.0
-    red, green, blue = colorsys.hsv_to_rgb(hue, rng.uniform(0.55, 0.95), rng.uniform(0.75, 1.0))
+    """Draw a colour of any hue, from dark to pale and from grey to saturated: a quarter are nearly grey."""
+    saturation = rng.uniform(0.0, 0.12) if rng.random() < 0.25 else rng.uniform(0.12, 0.95)
+    red, green, blue = colorsys.hsv_to_rgb(rng.uniform(), saturation, rng.uniform(0.3, 1.0))
     return round(red, 3), round(green, 3), round(blue, 3), 1.0

@@ -56,6 +56,11 @@ class ObjectRecord:
     urdf: str
     sha256: dict[str, str]
 
+    @property
+    def family(self) -> str:
+        """The main family."""
+        return self.families[0]
+
     def to_json(self) -> dict[str, Any]:
         """Return the record as plain JSON values."""
         return dataclasses.asdict(self)

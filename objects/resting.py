@@ -1,4 +1,4 @@
-"""Resting poses of a rigid body on a floor: how likely each is, how high the body stands, how wide a gripper must open.
+"""Resting poses of a rigid body on a floor: how likely each is, and which way is then up.
 
 Quasi-static: it falls in a random orientation, lands on the face below its centre of mass and tips over edges until
 that centre lies above the face it stands on. Dimension key: V points, F triangles of the convex hull.
@@ -10,20 +10,15 @@ import numpy as np
 import numpy.typing as npt
 import scipy.spatial
 
-from graspq.objects.geometry import Array, horizontal_axes
+from graspq.objects.geometry import Array
 
 
 @dataclasses.dataclass(frozen=True)
 class RestingPose:
-    """One stable pose: `probability`; `up` [3], the unit vector that then points up; `height` and `width` in metres.
-
-    `width` is the least horizontal width over all directions: what two parallel plates must open to pass the body.
-    """
+    """One stable pose: `probability`; `up` [3], the unit vector that then points up."""
 
     probability: float
     up: Array
-    height: float
-    width: float
 
 
 def resting_poses(points: Array, centre: Array, least: float = 0.01) -> tuple[RestingPose, ...]:
@@ -54,9 +49,7 @@ def resting_poses(points: Array, centre: Array, least: float = 0.01) -> tuple[Re
     for face in np.argsort(-weight, kind="stable"):
         if weight[face] < max(least, 1e-12):
             break
-        up = -planes[face, :3]
-        along = points @ up
-        poses.append(RestingPose(float(weight[face]), up, float(np.ptp(along)), narrowest_width(points, up)))
+        poses.append(RestingPose(float(weight[face]), -planes[face, :3]))
     return tuple(poses)
 
 
@@ -89,13 +82,3 @@ def _rolls_to(hull: scipy.spatial.ConvexHull, corners: Array, face_of: npt.NDArr
             if outside[triangle] > worst[face]:
                 worst[face], target[face] = float(outside[triangle]), int(neighbour[triangle])
     return target
-
-
-def narrowest_width(points: Array, up: Array) -> float:
-    """Return the least width of `points` [V, 3] over all directions perpendicular to `up`, metres.
-
-    The least width of a convex polygon is attained perpendicular to one of its edges (rotating calipers).
-    """
-    flat = points @ horizontal_axes(up)
-    outline = scipy.spatial.ConvexHull(flat)
-    return float(np.ptp(flat[outline.vertices] @ outline.equations[:, :2].T, axis=0).min())

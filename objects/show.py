@@ -21,7 +21,9 @@ _CELL, _LABEL, _HEAD = 1.55, 0.42, 0.75
 _INK, _PALE = "#22262e", "#6b7280"
 
 
-def contact_sheet(object_set: ObjectSet, out: Path, *, split: str | None = None, count: int | None = None) -> int:
+def contact_sheet(
+    object_set: ObjectSet, out: Path, *, split: str | None = None, count: int | None = None, by_family: int = 0
+) -> int:
     """Draw a labelled contact sheet as a PNG and return how many objects it shows.
 
     Args:
@@ -29,6 +31,7 @@ def contact_sheet(object_set: ObjectSet, out: Path, *, split: str | None = None,
         out: the PNG; its folder is made if need be.
         split: only this split; None for all.
         count: at most so many, the first of the set's order; None for all.
+        by_family: instead so many of each main family, if above 0; the families follow each other by name.
 
     Raises:
         UserError: no such split, `out` is no PNG or cannot be written, or a mesh is unreadable.
@@ -37,18 +40,25 @@ def contact_sheet(object_set: ObjectSet, out: Path, *, split: str | None = None,
         raise UserError(f"{out}: expected a file name that ends in .png")
     ids = object_set.ids(split)
     which = f"split {split}" if split is not None else "all splits"
-    subtitle = f"{which} · {len(ids[:count])} of {len(ids)} · one scale"
-    figure = _figure(object_set, ids[:count], subtitle)
+    shown = _first_of_families(object_set, ids, by_family) if by_family else ids[:count]
+    figure = _figure(object_set, shown, f"{which} · {len(shown)} of {len(ids)} · one scale", max(by_family, 1))
     try:
         with committed(out) as temporary:
             figure.savefig(temporary, format="png", dpi=_CELL_PIXELS / _CELL, facecolor=BACKGROUND)
     except OSError as error:
         raise UserError(f"{out}: cannot write the picture here ({error.strerror}); choose another file") from None
-    return len(ids[:count])
+    return len(shown)
 
 
-def _figure(object_set: ObjectSet, ids: tuple[str, ...], subtitle: str) -> Figure:
-    columns = _columns(len(ids))
+def _first_of_families(object_set: ObjectSet, ids: tuple[str, ...], count: int) -> tuple[str, ...]:
+    families: dict[str, list[str]] = {}
+    for object_id in ids:
+        families.setdefault(object_set[object_id].family, []).append(object_id)
+    return tuple(object_id for name in sorted(families) for object_id in families[name][:count])
+
+
+def _figure(object_set: ObjectSet, ids: tuple[str, ...], subtitle: str, together: int) -> Figure:
+    columns = _columns(len(ids), together)
     wide = max(columns, 3) * _CELL
     high = _HEAD + math.ceil(len(ids) / columns) * (_CELL + _LABEL) + 0.1
     figure = Figure(figsize=(wide, high))
@@ -70,10 +80,13 @@ def _figure(object_set: ObjectSet, ids: tuple[str, ...], subtitle: str) -> Figur
     return figure
 
 
-def _columns(count: int) -> int:
-    """Return the number of columns of a sheet somewhat wider than high, with few empty places in its last row."""
-    ideal = max(2, round(math.sqrt(1.5 * count)))
-    return min(range(ideal, ideal + 3), key=lambda columns: (-count % columns, columns))
+def _columns(count: int, together: int) -> int:
+    """Return the number of columns of a sheet somewhat wider than high, with few empty places in its last row.
+
+    It is a multiple of the number of objects that stay together.
+    """
+    ideal = max(2, round(math.sqrt(1.5 * count) / together))
+    return together * min(range(ideal, ideal + 3), key=lambda columns: (-count % (columns * together), columns))
 
 
 def _scene(object_set: ObjectSet, object_id: str) -> list[trimesh.Trimesh]:

@@ -1,4 +1,4 @@
-"""The object set of the targeted task: a purple cross to pick, four fixed distractors, four unseen distractors.
+"""The object set of the targeted task: a purple cross to pick, four fixed distractors, twice four unseen ones.
 
 Source: Quillen et al. 2018, section IV: a cross-shaped target among other objects in a cluttered bin.
 """
@@ -32,13 +32,20 @@ _DISTRACTORS: dict[str, tuple[tuple[str, Color], ...]] = {
         ("stone", (0.62, 0.82, 0.16, 1.0)),
         ("box", (0.88, 0.42, 0.38, 1.0)),
     ),
+    "validation-distractor": (
+        ("lathe", (0.86, 0.20, 0.28, 1.0)),
+        ("loft", (0.30, 0.60, 0.80, 1.0)),
+        ("bar", (0.80, 0.70, 0.40, 1.0)),
+        ("cluster", (0.24, 0.52, 0.30, 1.0)),
+    ),
 }
 
 
 def make_targeted(folder: Path | str, *, seed: int) -> ObjectSet:
     """Make the set of the targeted task and return it.
 
-    Splits: "target" holds the `cross`, "distractor" the four fixed ones, "test-distractor" the four unseen ones.
+    Splits: "target" holds the `cross`, "distractor" the four fixed ones, "test-distractor" and "validation-distractor"
+    four unseen ones each.
 
     Args:
         folder: where; missing, empty, or the same set already.

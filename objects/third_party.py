@@ -134,10 +134,7 @@ def _model(source: Path, object_id: str, path: Path, split: str, scale: float, d
         # A function of the id alone, so that an object keeps its colour when others are added.
         key = int.from_bytes(hashlib.sha256(object_id.encode()).digest()[:6], "little")
         color = draw_color(generator("objects/import", key))
-    try:
-        solid = Solid.of(parts)
-    except UserError as error:
-        raise UserError(f"{path}: {error.message}") from None
+    solid = Solid.of(parts)
     mass = described.mass if density is None else None
     if mass is None:
         mass = (density if density is not None else DENSITY) * solid.volume

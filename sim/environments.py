@@ -60,7 +60,7 @@ class Grasping(gymnasium.Env[dict[str, Any], np.ndarray], EzPickle):
         Args:
             task: `regular`, `targeted`, or `module:task` of your own.
             objects: folder of an object set; the project's own set by default.
-            split: `train` or `test`; the targeted task also has `test-clutter`.
+            split: `train`, `test` or `validation`; the targeted task also has `test-clutter`.
             render_mode: `rgb_array`, `human` (PyBullet's window) or None.
             depth_and_mask: `info` holds `depth` and `mask` of the image, as `graspq.sim.observation` describes them.
 

@@ -31,6 +31,7 @@ _CLOSED_AT_FIRST = 32  # simulation steps that fingers need to come together, at
 _CLOSE_CHECK = 2  # simulation steps
 _LIFT_STEPS = 84
 _HOLD_STEPS = 4  # the last simulation steps of an action, for the arm to come to rest
+_SHAPES_KEPT = 256  # so that the memory of a worker does not grow with the number of objects
 _FINISHED = "the episode has ended; call reset first"
 
 
@@ -90,6 +91,8 @@ class GraspSimulation:
     def _part(self, object_id: str, place: int) -> Part:
         """Return an object as the renderer draws it."""
         if object_id not in self._shapes:
+            if len(self._shapes) == _SHAPES_KEPT:
+                self._shapes.clear()
             whole = trimesh.util.concatenate(list(self.objects.parts_of(object_id)))
             self._shapes[object_id] = np.asarray(whole.vertices), np.asarray(whole.faces)
         return Part(*self._shapes[object_id], self.objects[object_id].color, place)

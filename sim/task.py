@@ -140,7 +140,7 @@ class RegularGrasping:
     """
 
     settings: TaskSettings = TaskSettings()
-    splits: ClassVar[tuple[str, ...]] = ("train", "test")
+    splits: ClassVar[tuple[str, ...]] = ("train", "test", "validation")
     object_set: ClassVar[str] = "regular"
 
     @property
@@ -177,22 +177,24 @@ class TargetedGrasping(RegularGrasping):
     """Targeted grasping in clutter: some copies of one target among other objects; only a lifted target is a success.
 
     Targets and distractors are the same in every episode, in training and in `test`, whose poses are unseen;
-    `test-clutter` has unseen distractors.
+    `test-clutter` and `validation` have unseen distractors, each its own.
 
     Source: Quillen et al. 2018, section IV.
     """
 
     settings: TaskSettings = TaskSettings(name="targeted", objects_per_bin=7, targets_per_bin=3)
-    splits: ClassVar[tuple[str, ...]] = ("train", "test", "test-clutter")
+    splits: ClassVar[tuple[str, ...]] = ("train", "test", "test-clutter", "validation")
     object_set: ClassVar[str] = "targeted"
 
     def draw(self, objects: ObjectSet, split: str, rng: np.random.Generator) -> tuple[str, ...]:
         """Return the target as often as the settings say, and the distractors; see `Task.draw`."""
         check_split(self, split)
         targets = at_least(objects, "target", 1)
-        distractors = "test-distractor" if split == "test-clutter" else "distractor"
+        unseen = {"test-clutter": "test-distractor", "validation": "validation-distractor"}
         count = self.settings.objects_per_bin - self.settings.targets_per_bin
-        return (targets[0],) * self.settings.targets_per_bin + at_least(objects, distractors, count)[:count]
+        return (targets[0],) * self.settings.targets_per_bin + at_least(
+            objects, unseen.get(split, "distractor"), count
+        )[:count]
 
     def wanted(self, objects: ObjectSet, object_id: str) -> bool:
         """Return whether the object is a target."""

@@ -18,8 +18,9 @@ settings.load_profile("shared-machine")
 
 @pytest.fixture(scope="session")
 def regular_objects(tmp_path_factory: pytest.TempPathFactory) -> ObjectSet:
-    """Thirty training and ten test objects of the project's own generator."""
-    return make_procedural(tmp_path_factory.mktemp("objects") / "regular", seed=0, train=30, test=10)
+    """Thirty training, ten test and ten validation objects of the project's own generator."""
+    folder = tmp_path_factory.mktemp("objects") / "regular"
+    return make_procedural(folder, seed=0, train=30, test=10, validation=10)
 
 
 @pytest.fixture(scope="session")

@@ -10,13 +10,14 @@ from graspq.objects.object_set import ObjectSet
 from graspq.objects.procedural import make_procedural
 
 SEED = 7
-TRAIN, TEST = 40, 8
+TRAIN, TEST, VALIDATION = 48, 8, 8
 
 
 @pytest.fixture(scope="session")
 def small_set(tmp_path_factory: pytest.TempPathFactory) -> ObjectSet:
-    """40 train and 8 test objects; not to be changed."""
-    return make_procedural(tmp_path_factory.mktemp("objects") / "small", seed=SEED, train=TRAIN, test=TEST)
+    """48 train, 8 test and 8 validation objects; not to be changed."""
+    folder = tmp_path_factory.mktemp("objects") / "small"
+    return make_procedural(folder, seed=SEED, train=TRAIN, test=TEST, validation=VALIDATION)
 
 
 @pytest.fixture

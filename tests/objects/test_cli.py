@@ -14,10 +14,10 @@ Run = Callable[..., tuple[int, str, str]]
 
 def test_make_show_and_make_again(grasp_objects: Run, tmp_path: Path) -> None:
     folder = tmp_path / "set"
-    arguments = ("make", "procedural", folder, "--seed", "3", "--train", "2", "--test", "1")
+    arguments = ("make", "procedural", folder, "--seed", "3", "--train", "2", "--test", "1", "--validation", "1")
     status, out, err = grasp_objects(*arguments)
     assert (status, err) == (0, "")
-    assert "3 procedural objects (2 train, 1 test), made" in out
+    assert "4 procedural objects (2 train, 1 test, 1 validation), made" in out
     status, out, _ = grasp_objects(*arguments)
     assert status == 0
     assert "already there, identical" in out
@@ -27,7 +27,7 @@ def test_make_show_and_make_again(grasp_objects: Run, tmp_path: Path) -> None:
 
 def test_make_targeted_and_import(grasp_objects: Run, tmp_path: Path) -> None:
     assert grasp_objects("make", "targeted", tmp_path / "targeted")[0] == 0
-    assert len(ObjectSet.load(tmp_path / "targeted")) == 9
+    assert len(ObjectSet.load(tmp_path / "targeted")) == 13
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box((30, 40, 50)).export(tmp_path / "meshes" / "box.stl")
     status, _, _ = grasp_objects("make", "import", tmp_path / "meshes", tmp_path / "set", "--scale", "0.001")
@@ -60,6 +60,10 @@ def _bad_inputs(tmp_path: Path) -> dict[str, tuple[tuple[str | Path, ...], str]]
         ),
         "a negative seed": (("make", "procedural", out, "--seed", "-1"), "--seed"),
         "no objects": (("make", "procedural", out, "--train", "0"), "--train"),
+        "an unknown family": (
+            ("make", "procedural", out, "--held-out-family", "egg"),
+            "--held-out-family egg: choose some",
+        ),
         "a word for a number": (("make", "procedural", out, "--train", "many"), "many"),
         "a negative scale": (("make", "import", tmp_path / "good", out, "--scale", "-1"), "--scale"),
         "no set to show": (("show", tmp_path / "nowhere", "--out", picture), "no object set"),
@@ -74,8 +78,8 @@ def _bad_inputs(tmp_path: Path) -> dict[str, tuple[tuple[str | Path, ...], str]]
     [
         "an empty mesh", "a mesh 3 m wide", "a missing folder", "a corrupted file", "a folder of other things",
         "another set", "the set in another size",
-        "a negative seed", "no objects", "a word for a number", "a negative scale", "no set to show",
-        "an unknown split", "no picture", "an unknown command",
+        "a negative seed", "no objects", "an unknown family", "a word for a number", "a negative scale",
+        "no set to show", "an unknown split", "no picture", "an unknown command",
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_line_with_status_2_and_leaves_nothing(

@@ -22,7 +22,7 @@ def copied(small_set: ObjectSet, tmp_path: Path) -> ObjectSet:
 def test_a_set_is_loaded_as_it_was_made(small_set: ObjectSet) -> None:
     loaded = ObjectSet.load(str(small_set.folder))
     assert loaded == small_set
-    assert (loaded.name, loaded.seed, len(loaded)) == ("procedural", 7, 48)
+    assert (loaded.name, loaded.seed, len(loaded)) == ("procedural", 7, 64)
     assert loaded.digest() == sha256_of(small_set.folder / "object_set.json")
     loaded.verify()
 
@@ -93,8 +93,8 @@ def test_a_damaged_set_is_not_copied(copied: ObjectSet, tmp_path: Path) -> None:
 def test_an_unknown_object_or_split_is_refused_with_what_there_is(small_set: ObjectSet) -> None:
     with pytest.raises(UserError, match="no object 'cup'"):
         small_set["cup"]
-    with pytest.raises(UserError, match="choose from train, test"):
-        small_set.ids("validation")
+    with pytest.raises(UserError, match="choose from train, test, validation"):
+        small_set.ids("mirror")
 
 
 def _first(values: dict[str, object]) -> Callable[[dict[str, Any]], dict[str, Any]]:

@@ -3,11 +3,7 @@ import pytest
 
 from graspq.common.seeding import generator
 from graspq.objects.geometry import half_spaces
-from graspq.objects.shapes import COMPOSITE, FAMILIES, MOST_PARTS, draw_shape, rotation
-
-
-def test_there_are_at_least_six_families() -> None:
-    assert len(FAMILIES) >= 6
+from graspq.objects.shapes import FAMILIES, MOST_PARTS, SIMPLE, draw_shape, rotation
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -22,12 +18,20 @@ def test_every_part_of_a_family_is_convex_watertight_and_of_few_faces(family: st
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_an_object_has_one_to_four_parts_or_up_to_eight_pieces_of_a_ring_or_bracket(family: str) -> None:
+def test_an_object_has_at_most_four_parts_of_a_simple_family_and_eight_of_another(family: str) -> None:
     for index in range(15):
         shape = draw_shape(generator("tests/objects", index), family)
-        assert 1 <= len(shape.parts) <= (MOST_PARTS if family in COMPOSITE else 4)
+        assert 1 <= len(shape.parts) <= (4 if family in SIMPLE else MOST_PARTS)
         assert shape.families[0] == family
-        assert len(shape.families) <= 4
+        assert set(shape.families[1:]) <= set(SIMPLE)
+
+
+def test_smaller_parts_are_of_the_asked_families_alone() -> None:
+    for extras in (["stone"], []):
+        drawn = {
+            name for index in range(15) for name in draw_shape(generator("tests/extras", index), "box", extras).families
+        }
+        assert drawn == {"box", *extras}
 
 
 def test_the_same_generator_draws_the_same_object_and_another_one_a_different_object() -> None:

@@ -21,6 +21,12 @@ def test_a_contact_sheet_is_a_png_that_shows_the_asked_objects(small_set: Object
     assert [path.name for path in out.parent.iterdir()] == ["test.png"]
 
 
+def test_a_sheet_by_family_shows_so_many_of_each_side_by_side(small_set: ObjectSet, tmp_path: Path) -> None:
+    assert contact_sheet(small_set, tmp_path / "families.png", split="train", by_family=2) == 32
+    picture = matplotlib.image.imread(tmp_path / "families.png")
+    assert round(picture.shape[1] / 232) % 2 == 0
+
+
 def test_the_same_set_gives_the_same_picture(small_set: ObjectSet, tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         contact_sheet(small_set, tmp_path / name, count=2)
@@ -32,8 +38,8 @@ def test_a_wrong_ending_an_unknown_split_and_an_unwritable_place_are_refused(
 ) -> None:
     with pytest.raises(UserError, match=r"\.png"):
         contact_sheet(small_set, tmp_path / "sheet.jpg")
-    with pytest.raises(UserError, match="no split 'validation'"):
-        contact_sheet(small_set, tmp_path / "sheet.png", split="validation")
+    with pytest.raises(UserError, match="no split 'mirror'"):
+        contact_sheet(small_set, tmp_path / "sheet.png", split="mirror")
     (tmp_path / "file").write_text("x")
     with pytest.raises(UserError, match="cannot write the picture"):
         contact_sheet(small_set, tmp_path / "file" / "sheet.png", count=1)

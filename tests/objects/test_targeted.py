@@ -7,16 +7,17 @@ from graspq.objects.geometry import half_spaces
 from graspq.objects.targeted import PURPLE, TARGET, cross, make_targeted
 
 
-def test_the_set_holds_a_purple_cross_four_fixed_and_four_unseen_distractors(tmp_path: Path) -> None:
+def test_the_set_holds_a_purple_cross_four_fixed_and_twice_four_unseen_distractors(tmp_path: Path) -> None:
     made = make_targeted(tmp_path / "targeted", seed=0)
     assert {split: len(made.ids(split)) for split in made.splits} == {
         "target": 1,
         "distractor": 4,
         "test-distractor": 4,
+        "validation-distractor": 4,
     }
     assert made[TARGET].color == PURPLE
     assert made[TARGET].split == "target"
-    assert len({record.color for record in made.objects}) == 9
+    assert len({record.color for record in made.objects}) == 13
     made.verify()
 
 

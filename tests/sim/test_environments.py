@@ -71,8 +71,8 @@ def test_rendering_gives_a_larger_picture_and_bad_arguments_one_line(folders, mo
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(UserError, match="needs a display"):
         gymnasium.make(NAMES["regular"], objects=folders["regular"], render_mode="human")
-    with pytest.raises(UserError, match="the regular task has train, test"):
-        gymnasium.make(NAMES["regular"], objects=folders["regular"], split="validation")
+    with pytest.raises(UserError, match="the regular task has train, test, validation"):
+        gymnasium.make(NAMES["regular"], objects=folders["regular"], split="mirror")
 
 
 def test_a_copy_is_an_environment_of_its_own_with_the_same_arguments(folders):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from graspq.common.errors import UserError
+from graspq.objects.procedural import make_procedural
 from graspq.sim.task import TASKS, RegularGrasping, task_from_json, task_named
 
 OWN = """
@@ -42,14 +43,27 @@ def test_a_regular_bin_holds_five_different_objects_of_the_split(regular_objects
         assert {regular_objects[object_id].split for object_id in ids} == {"test"}
 
 
+def test_every_split_of_a_task_fills_a_bin_and_a_set_without_one_says_what_it_has(
+    regular_objects, targeted_objects, tmp_path
+):
+    rng = np.random.default_rng(0)
+    for task, objects in ((TASKS["regular"], regular_objects), (TASKS["targeted"], targeted_objects)):
+        for split in task.splits:
+            assert len(task.draw(objects, split, rng)) == task.settings.objects_per_bin
+    without = make_procedural(tmp_path / "set", seed=0, train=1, test=1, validation=0)
+    with pytest.raises(UserError, match="no split 'validation'; choose from train, test"):
+        TASKS["regular"].draw(without, "validation", rng)
+
+
 def test_a_targeted_bin_holds_three_crosses_and_four_fixed_distractors(targeted_objects):
     task, rng = TASKS["targeted"], np.random.default_rng(0)
-    train, test, clutter = (task.draw(targeted_objects, split, rng) for split in ("train", "test", "test-clutter"))
+    train, test, clutter, validation = (task.draw(targeted_objects, split, rng) for split in task.splits)
     splits = [targeted_objects[object_id].split for object_id in train]
     assert splits == ["target"] * 3 + ["distractor"] * 4
     assert train == test
     assert train[:3] == clutter[:3]
-    assert not set(train[3:]) & set(clutter[3:])
+    assert train[:3] == validation[:3]
+    assert len({*train[3:], *clutter[3:], *validation[3:]}) == 12
 
 
 def test_lifting_another_object_beside_a_target_still_counts(targeted_objects):
