@@ -11,7 +11,7 @@ from graspq.datagen.settings import CollectionSettings
 from graspq.datasets.manifest import Manifest
 
 # Measured with the default task on a 2-core machine (README, "What a grasp costs"); for the forecast alone.
-BYTES_PER_GRASP = 6_600
+BYTES_PER_GRASP = 5_600
 GRASPS_PER_SECOND_AND_CORE = 14.0
 _SPARE_BYTES = 64 * 2**20
 
