@@ -41,7 +41,7 @@ def objects(regular_objects):
 def finished(tmp_path_factory, objects):
     folder = tmp_path_factory.mktemp("data") / "one"
     done = run(*SMALL, "--out", folder, "--objects", objects, "--workers", 1)
-    assert re.search(r"130 regular grasps to collect .* about 468.0 kB and [\d.]+ s", done.stdout)
+    assert re.search(r"130 regular grasps to collect .* about 728.0 kB and [\d.]+ s", done.stdout)
     return folder
 
 
