@@ -156,7 +156,9 @@ def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> d
 
 
 def _row_group(ref: BlockRef, names: list[str], metadata: Any) -> pa.Table:
-    with pq.ParquetFile(ref.path, metadata=metadata, page_checksum_verification=True, memory_map=False) as file:
+    # Reading ahead by threads of Arrow's gains nothing here: a block is read whole, and several are at a time.
+    options = {"page_checksum_verification": True, "memory_map": False, "pre_buffer": False}
+    with pq.ParquetFile(ref.path, metadata=metadata, **options) as file:
         return file.read_row_group(ref.row_group, columns=names, use_threads=False)
 
 

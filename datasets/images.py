@@ -44,11 +44,11 @@ def from_arrow(array: pa.Array, image_shape: tuple[int, int, int]) -> UInt8:
         first = header(image_shape)
         width = len(first) + math.prod(image_shape)
         starts = np.frombuffer(array.buffers()[1], np.int32, len(array) + 1, array.offset * 4)
-        if (np.diff(starts) != width).any():
+        if (starts[1:] - starts[:-1] != width).any():
             raise ValueError(f"image: expected a PPM of {width} bytes")
         flat = np.frombuffer(array.buffers()[2], np.uint8, len(array) * width, int(starts[0]))
         files = flat.reshape(len(array), width)
-        if (files[:, : len(first)] != np.frombuffer(first, np.uint8)).any():
+        if files[:, : len(first)].tobytes() != first * len(array):
             raise ValueError(f"image: expected a PPM that begins with {first!r}")
         images = files[:, len(first) :].reshape(len(array), *image_shape)
     images.flags.writeable = False
