@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from graspq.evaluate.films import Film, write_films
-from graspq.evaluate.records import EpisodeRow, Evaluation, write_rows, write_summary
+from graspq.evaluate.records import FORMAT_VERSION, EpisodeRow, Evaluation, write_rows, write_summary
 from graspq.evaluate.statistics import paired_difference, wilson_interval
 from graspq.report.findings import calibration_of, comparisons, gather
 from graspq.report.page import render, write_report
@@ -73,7 +73,7 @@ def make_evaluation(
     write_films(folder, [Film(row, frames) for row in rows[:films]])
     count, total = int(sum(successes)), len(rows)
     summary = {
-        "format_version": 1, "label": label, "task": "regular", "split": "test", "episodes": total,
+        "format_version": FORMAT_VERSION, "label": label, "task": "regular", "split": "test", "episodes": total,
         "successes": count, "success_rate": count / total, "ci95": list(wilson_interval(count, total)),
         "mean_steps": 4.0, "ends": {"height": total, "T": 0}, "policy": policy, "run": None, "checkpoint_step": None,
         "seed": seed, "object_set": {"name": "procedural", "sha256": "ab" * 32}, "command": f"grasp-eval {label}",

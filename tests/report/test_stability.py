@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.evaluate.records import write_summary
+from graspq.evaluate.records import FORMAT_VERSION, write_summary
 from graspq.report.charts import PLOT
 from graspq.report.findings import gather
 from graspq.report.page import render
@@ -92,8 +92,8 @@ def test_a_page_says_that_its_best_was_selected_among_the_jobs_of_a_sweep(sweep:
         write_summary(
             folder,
             {
-                "format_version": 1, "label": folder.name, "task": "regular", "split": "validation", "episodes": 4,
-                "successes": 3, "success_rate": 0.75, "ci95": [0.3, 0.95], "mean_steps": 4.0, "policy": "cem",
+                "format_version": FORMAT_VERSION, "label": folder.name, "task": "regular", "split": "validation",
+                "episodes": 4, "successes": 3, "success_rate": 0.75, "ci95": [0.3, 0.95], "mean_steps": 4.0, "policy": "cem",
                 "seed": 0, "job": {},
             },
         )  # fmt: skip
