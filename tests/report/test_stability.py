@@ -93,8 +93,8 @@ def test_a_page_says_that_its_best_was_selected_among_the_jobs_of_a_sweep(sweep:
             folder,
             {
                 "format_version": FORMAT_VERSION, "label": folder.name, "task": "regular", "split": "validation",
-                "episodes": 4, "successes": 3, "success_rate": 0.75, "ci95": [0.3, 0.95], "mean_steps": 4.0, "policy": "cem",
-                "seed": 0, "job": {},
+                "episodes": 4, "successes": 3, "success_rate": 0.75, "ci95": [0.3, 0.95], "mean_steps": 4.0,
+                "policy": "cem", "seed": 0, "job": {},
             },
         )  # fmt: skip
     assert "selected by" not in render(gather([other], None))
