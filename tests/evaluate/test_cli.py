@@ -255,7 +255,7 @@ def test_a_damaged_mesh_is_refused_before_anything_runs(objects_folder: Path, co
 def test_another_object_set_than_the_runs_must_be_asked_for(
     run_folder: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from graspq.objects.procedural import GENERATOR_VERSION, make_procedural
+    from graspq.objects.procedural import GENERATOR_VERSION, SEED, make_procedural
 
     monkeypatch.chdir(tmp_path)
     moved = tmp_path / "run"
@@ -264,7 +264,9 @@ def test_another_object_set_than_the_runs_must_be_asked_for(
     config["dataset"]["object_set"] = {"name": "procedural", "sha256": "0" * 64}
     (moved / "config.json").write_text(json.dumps(config))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    own = make_procedural(tmp_path / f"graspq/objects/regular-{GENERATOR_VERSION}", seed=0, train=5, test=5)
+    own = make_procedural(
+        tmp_path / f"graspq/objects/regular-{GENERATOR_VERSION}", seed=SEED, train=5, test=5, validation=0
+    )
     done = command("grasp-eval", moved, *SMALL, "--plan")
     assert done.code == 2 and "not the object set of the run's data" in done.lines[0]
     assert command("grasp-eval", moved, *SMALL, "--plan", "--objects", own.folder).code == 0

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from graspq.evaluate.records import EpisodeRow, write_rows, write_summary
+from graspq.evaluate.records import FORMAT_VERSION, EpisodeRow, write_rows, write_summary
 from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
 from graspq.studies.sweep.settings import SweepSettings
@@ -51,9 +51,10 @@ def scored(trial: Trial, successes: int, step: int = 100, episodes: int = 10, **
     rows = [EpisodeRow(index, 0, (), index < successes, None, 4, "height", 0.0, None) for index in range(episodes)]
     write_rows(place, rows)
     summary = {
-        "format_version": 1, "task": "regular", "split": "test", "episodes": episodes, "successes": successes,
-        "success_rate": successes / episodes, "ci95": list(wilson_interval(successes, episodes)), "label": trial.name,
-        "job": {}, "seed": 0, "checkpoint_step": step, "cem": CemSettings().to_json(), "policy": "cem",
+        "format_version": FORMAT_VERSION, "task": "regular", "split": "test", "episodes": episodes,
+        "successes": successes, "success_rate": successes / episodes,
+        "ci95": list(wilson_interval(successes, episodes)), "label": trial.name, "job": {}, "seed": 0,
+        "checkpoint_step": step, "cem": CemSettings().to_json(), "policy": "cem",
     }  # fmt: skip
     write_summary(place, summary | changed)
     return place

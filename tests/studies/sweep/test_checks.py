@@ -42,8 +42,8 @@ def test_data_and_scenes_that_are_not_there_are_refused(
     check_data(here, trials)
     with pytest.raises(UserError, match="absent"):
         check_data(dataclasses.replace(settings, shards=(str(tmp_path / "absent"),)), trials)
-    with pytest.raises(UserError, match="split 'validation'"):
-        check_data(dataclasses.replace(here, split="validation"), trials)
+    with pytest.raises(UserError, match="split 'test-clutter'"):
+        check_data(dataclasses.replace(here, split="test-clutter"), trials)
     with pytest.raises(UserError, match="no object set"):
         check_data(dataclasses.replace(here, objects=tmp_path), trials)
     write.trained(trials[0], 50)
