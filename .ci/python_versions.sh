@@ -18,7 +18,7 @@ at_hand() { # a command that starts Python $1, or nothing
 }
 
 digests() { # collect with the Python $1 and print a hash of all steps and episodes
-  (cd "$out" && rm -rf data && "$root/${1%python}grasp-datagen" --size 40 --workers 1 --seed 7 --out data >/dev/null &&
+  (cd "$out" && rm -rf data && "$root/${1%python}grasp-datagen" --size 40 --workers 1 --seed 7 --out data >log 2>&1 || (cat log >&2 && exit 1)
     cd data && sha256sum shards/*.parquet episodes/*.parquet)
 }
 

@@ -5,7 +5,7 @@ do the rest. Where the gripper meets nothing on its way the arm may be put there
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -13,13 +13,14 @@ from graspq.sim import kinematics, robot_model
 from graspq.sim.bullet import bullet
 from graspq.sim.clearance import Boxes
 from graspq.sim.task import TaskSettings
-from graspq.sim.world import World
+from graspq.sim.world import Body, World
 
 _PARKED = (0.45, 0.0, 0.55, 0.0)  # over the bin and out of the way of falling objects
 _ARM_FORCE = 150.0  # newton metres, more than the real arm's so that set-points are followed
 _ARM_GAIN = 0.35
 _FINGER_SPEED = 0.3  # metres a second
 _TCP_LINK = 11
+_ASK_EVERY = 6  # simulation steps
 
 
 class Arm:
@@ -97,18 +98,38 @@ class Arm:
                 physicsClientId=self.client,
             )
 
-    def move(self, pose: Sequence[float] | np.ndarray, steps: int, hold: int = 0) -> None:
-        """Move in a straight line to a pose in `steps` simulation steps, then hold it for `hold` more."""
-        for here in self._way(pose, steps):
+    def move(
+        self,
+        pose: Sequence[float] | np.ndarray,
+        steps: int,
+        hold: int = 0,
+        is_in_vain: Callable[[], bool] | None = None,
+    ) -> bool:
+        """Move in a straight line to a pose in `steps` simulation steps, then hold it for `hold` more.
+
+        Args:
+            pose: where to.
+            steps: of the way.
+            hold: at its end.
+            is_in_vain: asked every few steps on the way whether to stop there.
+
+        Returns:
+            Whether the arm went all the way.
+        """
+        for index, here in enumerate(self._way(pose, steps), start=1):
             joints = kinematics.joint_angles(*here)
             speeds = [(now - before) / self.world.time_step for now, before in zip(joints, self._joints, strict=True)]
             self._hold(joints, speeds)
             self._joints = joints
             self.world.step()
+            if is_in_vain is not None and index % _ASK_EVERY == 0 and is_in_vain():
+                self.commanded = np.array(here)
+                return False
         if hold > 0:
             self._hold(self._joints, (0.0,) * 7)
             self.world.step(hold)
         self.commanded = np.array(pose, dtype=float)
+        return True
 
     def carry(self, pose: Sequence[float] | np.ndarray, steps: int, *, open_gripper: bool = True) -> None:
         """Put the arm at a pose, at rest; whoever watches the world sees the way that `move` would take."""
@@ -159,3 +180,13 @@ class Arm:
         """Return the distance between the pads, metres."""
         client = self.client
         return float(sum(bullet.getJointState(self.number, f, physicsClientId=client)[0] for f in self.fingers))
+
+    def tip_height(self) -> float:
+        """Return the measured height of the finger tips, metres."""
+        return float(self.pose()[2] + (self.gripper.centers - self.gripper.halves)[:, 2].min())
+
+    def is_touching(self, bodies: Sequence[Body]) -> bool:
+        """Return whether hand or fingers touched one of the bodies in the last simulation step."""
+        contacts = bullet.getContactPoints(bodyA=self.number, physicsClientId=self.client)
+        numbers = {body.number for body in bodies}
+        return any(contact[2] in numbers for contact in contacts)

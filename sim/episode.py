@@ -24,8 +24,8 @@ from graspq.sim.world import Body, World
 
 _DESCEND_SPEED = 0.0025  # metres a simulation step
 _CLOSE_STEPS = 40
-# Pads nearer than this have nothing between them, and what holds nothing lifts nothing: docs/simulator.md has the
-# gaps of 11,000 grasps. Fingers that met nothing are at 0.1 to 0.2 mm; the thinnest object that was lifted, at 1.4 mm.
+# Pads nearer than this have nothing between them; where the gripper touches no object either, it lifts nothing:
+# docs/simulator.md has the gaps of 14,000 grasps. Fingers that met nothing are at 0.1 to 0.2 mm.
 _EMPTY_GAP = 0.001  # metres
 _CLOSED_AT_FIRST = 32  # simulation steps that fingers need to come together, at least
 _CLOSE_CHECK = 2  # simulation steps
@@ -192,6 +192,8 @@ class GraspSimulation:
     def _close_and_lift(self, *, descend: bool) -> list[str]:
         """Close where the gripper is (below the trigger height after a descent to the grasp height), then lift.
 
+        As soon as the gripper is known to hold nothing the rest is not simulated.
+
         Returns the ids of the lifted objects, highest first.
         """
         pose = self.arm.commanded.copy()
@@ -201,25 +203,38 @@ class GraspSimulation:
             self._move(pose, steps, hold=2)
         holds = self._close()
         pose[2] += self.task.settings.lift_height
-        if not holds:
+        if not (holds and self.arm.move(pose, _LIFT_STEPS, hold=4, is_in_vain=self._is_in_vain)):
             self.arm.carry(pose, _LIFT_STEPS, open_gripper=False)
             return []
-        self.arm.move(pose, _LIFT_STEPS, hold=4)
         heights = [body.pose()[0][2] for body in self.bodies]
         ranked = sorted(range(len(heights)), key=lambda index: -heights[index])
         return [self.object_ids[index] for index in ranked if heights[index] > self.task.settings.success_height]
 
     def _close(self) -> bool:
-        """Close the gripper; return whether there is anything between its pads."""
+        """Close the gripper; return whether it may hold anything: its pads are apart, or it touches an object.
+
+        Closed fingers may still hook an object: one grasp in ten thousand.
+        """
         if self._is_clear(self.arm.between_pads, self.arm.commanded):
             return False
         self.arm.grip(open_gripper=False)
         self.world.step(_CLOSED_AT_FIRST)
         for _ in range(_CLOSED_AT_FIRST, _CLOSE_STEPS, _CLOSE_CHECK):
-            if self.arm.finger_gap() < _EMPTY_GAP:
+            if self._is_empty():
                 return False
             self.world.step(_CLOSE_CHECK)
-        return self.arm.finger_gap() >= _EMPTY_GAP
+        return not self._is_empty()
+
+    def _is_empty(self) -> bool:
+        """Return whether the pads are together and nothing touches the gripper."""
+        return self.arm.finger_gap() < _EMPTY_GAP and not self.arm.is_touching(self.bodies)
+
+    def _is_in_vain(self) -> bool:
+        """Return whether the empty gripper is above all objects, and none of them can be high enough at the end."""
+        if not self._is_empty():
+            return False
+        tip, most = self.arm.tip_height(), self.task.settings.success_height
+        return all(body.bounds()[1][2] < tip and body.apex() < most for body in self.bodies)
 
     def render(self, size: int) -> np.ndarray:
         """Return the camera's view at another resolution, uint8 [size, size, 3]."""

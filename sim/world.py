@@ -17,6 +17,7 @@ from graspq.common.errors import UserError
 from graspq.sim.bullet import bullet
 
 Vector = Sequence[float] | np.ndarray
+_GRAVITY = 9.81  # metres a second squared
 
 
 class World:
@@ -48,7 +49,7 @@ class World:
     def reset(self) -> None:
         """Empty the world. Everything that follows is a function of the calls that follow."""
         bullet.resetSimulation(physicsClientId=self.client)
-        bullet.setGravity(0, 0, -9.81, physicsClientId=self.client)
+        bullet.setGravity(0, 0, -_GRAVITY, physicsClientId=self.client)
         # Overlapping pairs in a fixed order: without it the solver may meet contacts in another order each run.
         bullet.setPhysicsEngineParameter(
             deterministicOverlappingPairs=1, enableFileCaching=1, physicsClientId=self.client
@@ -167,6 +168,12 @@ class Body:
         """Return the greatest component of velocity, metres a second; turns count at a radius of 0.03 m."""
         linear, angular = bullet.getBaseVelocity(self.number, physicsClientId=self.world.client)
         return float(max(max(map(abs, linear)), 0.03 * max(map(abs, angular))))
+
+    def apex(self) -> float:
+        """Return the height that the body's centre reaches in free flight, metres."""
+        client = self.world.client
+        rising = bullet.getBaseVelocity(self.number, physicsClientId=client)[0][2]
+        return float(self.pose()[0][2] + max(0.0, rising) ** 2 / (2.0 * _GRAVITY))
 
     def change_dynamics(self, link: int = -1, **values: Any) -> None:
         """Set dynamics properties of a link (-1 is the base); names as in PyBullet."""

@@ -166,18 +166,50 @@ def test_what_lies_in_the_way_is_met(simulation):
     assert np.abs(simulation.object_poses() - before).max() > 0.001
 
 
-def test_fingers_that_close_on_nothing_lift_nothing_and_rise_all_the_same(simulation):
-    empty = 0
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        simulation.reset(rng)
+def random_grasp(simulation, seed):
+    rng = np.random.default_rng(seed)
+    simulation.load(simulation.object_ids)
+    simulation.reset(rng)
+    outcome = simulation.step(RandomPolicy().act(None, rng))
+    while not outcome.terminated:
         outcome = simulation.step(RandomPolicy().act(None, rng))
-        while not outcome.terminated:
-            outcome = simulation.step(RandomPolicy().act(None, rng))
-        pose = outcome.observation.gripper_pose
-        assert pose[2] == pytest.approx(simulation.arm.commanded[2], abs=0.004)
-        assert pose[2] > TASK.settings.lift_height
-        if simulation.arm.finger_gap() < 0.001:
-            empty += 1
-            assert outcome.reward == 0.0
-    assert empty >= 2
+    return outcome
+
+
+def test_a_grasp_whose_outcome_is_known_ends_early_as_the_whole_lift_would(simulation, monkeypatch):
+    taken = []
+    step = simulation.world.step
+
+    def counted(count=1):
+        taken.append(count)
+        step(count)
+
+    monkeypatch.setattr(simulation.world, "step", counted)
+
+    def grasps():
+        taken.clear()
+        outcomes = [random_grasp(simulation, seed) for seed in range(10)]
+        heights = [outcome.observation.gripper_pose[2] for outcome in outcomes]
+        return [outcome.info["lifted_object"] for outcome in outcomes], heights, sum(taken)
+
+    early, heights, few = grasps()
+    monkeypatch.setattr(simulation, "_is_empty", lambda: False)
+    whole, whole_heights, many = grasps()
+    assert early == whole
+    assert 0 < sum(lifted is not None for lifted in early) < 10
+    np.testing.assert_allclose(heights, whole_heights, atol=0.004)
+    assert few < 0.9 * many
+
+
+def test_closed_fingers_that_touch_an_object_are_lifted_all_the_same(simulation):
+    simulation.reset(np.random.default_rng(0))
+    simulation.arm.place(simulation.arm.home(), open_gripper=False)
+    simulation.world.step()
+    assert simulation._is_empty()
+    x, y, z = simulation.bodies[0].pose()[0]
+    simulation.arm.place((x, y, z, 0.0), open_gripper=False)
+    simulation.world.step()
+    assert simulation.arm.finger_gap() < 0.001
+    assert simulation.arm.is_touching(simulation.bodies)
+    assert not simulation.arm.is_touching([])
+    assert not simulation._is_empty()
