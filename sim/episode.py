@@ -80,7 +80,8 @@ class GraspSimulation:
     def load(self, object_ids: Sequence[str]) -> None:
         """Empty the world and build the cell with these objects."""
         self.world.reset()
-        self._fixed = cell.build_bin(self.world, self.task.settings)
+        # They never move: asked once, not at every action.
+        self._fixed = [part.bounds() for part in cell.build_bin(self.world, self.task.settings)]
         self.arm = Arm(self.world, self.task.settings)
         self.object_ids = tuple(object_ids)
         self.bodies = cell.load_objects(self.world, self.task.settings, self.objects, object_ids)
@@ -186,7 +187,7 @@ class GraspSimulation:
         """Return whether all objects rest and boxes of the gripper meet nothing from where it is to a pose."""
         if not cell.at_rest(self.bodies):
             return False
-        obstacles = Boxes([body.bounds() for body in (*self._fixed, *self.bodies)])
+        obstacles = Boxes([*self._fixed, *(body.bounds() for body in self.bodies)])
         return is_clear(gripper, self.arm.commanded.tolist(), pose.tolist(), obstacles)
 
     def _close_and_lift(self, *, descend: bool) -> list[str]:
