@@ -16,13 +16,13 @@ import numpy as np
 
 from graspq.common.action_space import ActionSpace
 from graspq.common.errors import UserError
-from graspq.datasets.batch import EpisodeBatch, TransitionBatch, gather_episodes, gather_transitions
 from graspq.datasets.blocks import BlockArrays, BlockRef, read_block, read_columns, read_episode_rows
 from graspq.datasets.columns import RecordType, record_dtype
 from graspq.datasets.episode import Episode
 from graspq.datasets.images import decoded
 from graspq.datasets.loader import DEFAULT_BUFFER_BYTES, Gather, Loader, in_order
 from graspq.datasets.sampler import Sampler
+from graspq.datasets.samples import EpisodeBatch, TransitionBatch, gather_episodes, gather_transitions
 
 if TYPE_CHECKING:
     from graspq.datasets.torch_dataset import TorchDataset

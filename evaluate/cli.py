@@ -1,6 +1,6 @@
 """`grasp-eval`: score runs, the random policy, the oracle and users' policies on scenes that no training has seen.
 
-The way on: `jobs` (what to do) -> `batch` (the plan) -> `evaluation` -> `rollout`, played by `sim/play`.
+The way on: `jobs` (what to do) -> `job_units` (the plan) -> `evaluation` -> `rollout`, played by `sim/play`.
 """
 
 from pathlib import Path
@@ -51,7 +51,7 @@ def evaluate(settings: EvalSettings) -> int:
     """
     if settings.engine == "local" and settings.workers != 0 and not settings.plan:
         warm_up((*MODULES, *(MODULES_OF_RUNS if settings.runs or settings.jobs is not None else ())))
-    from graspq.evaluate.batch import make_plan, plan_table, run_plan
+    from graspq.evaluate.job_units import make_plan, plan_table, run_plan
     from graspq.evaluate.jobs import jobs_from_settings
 
     jobs = jobs_from_settings(settings)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from graspq.datasets.batch import EpisodeBatch, TransitionBatch
+from graspq.datasets.samples import EpisodeBatch, TransitionBatch
 
 # Where a sample comes from; no estimator asks.
 SOURCES = ("episode_id", "block")

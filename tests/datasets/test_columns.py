@@ -7,11 +7,11 @@ import pytest
 from click.testing import CliRunner
 
 from graspq.datasets import columns
-from graspq.datasets.batch import Samples
 from graspq.datasets.cli import main
 from graspq.datasets.columns import EPISODES, STEPS, EpisodeColumn, StepColumn, quantities
 from graspq.datasets.dataset import Shard, open_shards
 from graspq.datasets.manifest import Manifest
+from graspq.datasets.samples import Samples
 from graspq.datasets.verify import verify
 from graspq.datasets.writer import commit_shard, write_shard
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.datasets.batch import EpisodeBatch, TransitionBatch
 from graspq.datasets.dataset import open_shards
+from graspq.datasets.samples import EpisodeBatch, TransitionBatch
 
 SHAPE = (8, 8, 3)
 

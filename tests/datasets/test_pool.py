@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 import graspq
 from graspq.common.errors import UserError
-from graspq.datasets.batch import EpisodeBatch
+from graspq.datasets.samples import EpisodeBatch
 
 
 @pytest.fixture(scope="module")

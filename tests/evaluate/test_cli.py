@@ -75,7 +75,7 @@ def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -
 def test_policies_without_a_run_meet_the_scenes_of_the_run_beside_them(
     workplace: SimpleNamespace, run_folder: Path, tmp_path: Path
 ) -> None:
-    from graspq.evaluate.batch import make_plan
+    from graspq.evaluate.job_units import make_plan
     from graspq.evaluate.jobs import jobs_from_settings
 
     other = tmp_path / "run"
@@ -96,7 +96,7 @@ def test_policies_without_a_run_meet_the_scenes_of_the_run_beside_them(
 def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_have_in_common(
     workplace: SimpleNamespace, run_folder: Path, targeted_objects: ObjectSet, tmp_path: Path
 ) -> None:
-    from graspq.evaluate.batch import make_plan
+    from graspq.evaluate.job_units import make_plan
     from graspq.evaluate.jobs import jobs_from_settings
 
     targeted = tmp_path / "targeted"
@@ -119,7 +119,7 @@ def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_hav
 def test_jobs_of_one_plan_that_differ_in_the_search_alone_have_folders_of_their_own(
     workplace: SimpleNamespace, run_folder: Path, tmp_path: Path
 ) -> None:
-    from graspq.evaluate.batch import make_plan
+    from graspq.evaluate.job_units import make_plan
     from graspq.evaluate.jobs import jobs_from_settings
 
     settings = replace(workplace.settings, policy=(), out=tmp_path / "scores")

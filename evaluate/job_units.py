@@ -131,28 +131,27 @@ def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None
     Raises:
         UserError: the only job fails, or the table cannot be written.
     """
-    endings: list[Ending[Planned]] = []
+    failed, rows = False, list[dict[str, Any]]()
 
     def report(ending: Ending[Planned]) -> None:
-        endings.append(ending)
-        click.echo(_line(ending), err=ending.error is not None)
+        nonlocal failed
+        failed |= ending.error is not None
+        # Read once: reading checks the digests of all its files.
+        evaluation = ending.unit.evaluation if ending.error is None else None
+        click.echo(_line(ending, evaluation), err=ending.error is not None)
         if table is not None:
             writable_folder(table, "results table")
-            rows = [_row(one) for one in endings]
+            rows.append(_row(ending, evaluation))
             write_jsonl(table / "results.jsonl", rows)
             write_csv(table / "results.csv", COLUMNS, rows)
 
     carry_out(plan, report, again=settings.again, keep_going=len(plan) > 1)
-    return all(ending.error is None for ending in endings)
+    return not failed
 
 
-def _evaluation(ending: Ending[Planned]) -> Evaluation | None:
-    return ending.unit.evaluation if ending.error is None else None
-
-
-def _line(ending: Ending[Planned]) -> str:
+def _line(ending: Ending[Planned], evaluation: Evaluation | None) -> str:
     """Return what became of a job, for the terminal."""
-    evaluation, label = _evaluation(ending), ending.unit.job.label
+    label = ending.unit.job.label
     if evaluation is None:
         return f"{label}: failed: {ending.error}"
     summary = evaluation.summary
@@ -164,9 +163,9 @@ def _line(ending: Ending[Planned]) -> str:
     )
 
 
-def _row(ending: Ending[Planned]) -> dict[str, Any]:
+def _row(ending: Ending[Planned], evaluation: Evaluation | None) -> dict[str, Any]:
     """Return a job's row of the table of results."""
-    job, evaluation = ending.unit.job, _evaluation(ending)
+    job = ending.unit.job
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {name: getattr(job, name) for name in ("label", "policy", "task", "split", "seed", "episodes")}
     row["run"], row["error"] = job.run.as_posix() if job.run is not None else None, ending.error
