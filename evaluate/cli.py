@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 # What workers will import, while this process finds out what there is to do.
 MODULES = ("graspq.evaluate.rollout", "graspq.sim.episode")
 MODULES_OF_RUNS = ("graspq.policies.of_run", "graspq.train.networks.default")
+WHAT_TEST_IS_FOR = (
+    "for the one score of a recipe that is frozen; networks, settings and checkpoints are chosen on validation"
+)
 RESULTS = Path("runs/evaluations")
 
 
@@ -59,6 +62,8 @@ def evaluate(settings: EvalSettings) -> int:
     if settings.video is not None:
         _check_video(settings.video, several)
     plan = make_plan(jobs, settings)
+    for split in dict.fromkeys(job.split for job in jobs if job.split.startswith("test")):
+        click.echo(f"--split {split}: {WHAT_TEST_IS_FOR}", err=True)
     if several or settings.plan:
         click.echo(plan_table(plan))
     if settings.plan:

@@ -40,7 +40,7 @@ class Job:
     run: Path | None
     policy: str | None
     task: str | None = None
-    split: str = "test"
+    split: str = "validation"
     seed: int = 0
     episodes: int = 1000
     objects: Path | None = None

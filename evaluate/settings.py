@@ -25,9 +25,9 @@ class EvalSettings(CemOptions, EngineSettings):
         "else regular.",
     )
     split: str = setting(
-        "test",
-        help="Split of the object set, such as test, or validation to choose by; test-clutter for unseen distractors "
-        "(targeted).",
+        "validation",
+        help="Split of the object set: validation, to choose by; test (targeted: test-clutter too), for the one score "
+        "of a recipe that is frozen; train.",
     )
     episodes: int = setting(1000, help="Episodes (grasps) of each job, such as 200 or 1k.", parse=parse_count)
     seed: int = setting(0, help="Seed of the scenes: the same seed gives every policy the same scenes.", minimum=0)

@@ -63,7 +63,9 @@ class SweepSettings(EngineSettings):
         (), help="Dataset folders, shard files or globs. Default: data/regular-10k (small), data/regular-100k (paper)."
     )
     objects: Path | None = setting(None, help="Object set of the evaluations. Default: the one of the data.")
-    split: str = setting("test", help="Split of the object set that runs are scored on.")
+    split: str = setting(
+        "validation", help="Split of the object set that runs are scored on: points are chosen on validation alone."
+    )
     learning_rate: tuple[float, ...] = setting((), help="Learning rates. Default: 0.01, 0.001 and 0.0001.")
     width: tuple[int, ...] = setting((), help="Units of the paper's network. Default: 32 and 64.")
     discount: tuple[float, ...] = setting((), help="Discounts of the estimators that use one. Default: 0.9 and 0.95.")

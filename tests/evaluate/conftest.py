@@ -17,7 +17,7 @@ def objects_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from graspq.objects.procedural import make_procedural
 
     folder = tmp_path_factory.mktemp("objects") / "regular"
-    make_procedural(folder, seed=0, train=6, test=6, validation=0)
+    make_procedural(folder, seed=0, train=6, test=6, validation=6)
     return folder
 
 

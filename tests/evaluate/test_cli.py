@@ -42,10 +42,10 @@ def test_an_evaluation_holds_what_the_design_promises(
     workplace: SimpleNamespace, run_folder: Path, dataset: Path
 ) -> None:
     assert workplace.status == 0
-    evaluation = Evaluation.load(workplace.out / "mc-regular-test-seed0-2")
+    evaluation = Evaluation.load(workplace.out / "mc-regular-validation-seed0-2")
     summary, rows = evaluation.summary, evaluation.rows()
     assert [row.episode for row in rows] == [0, 1]
-    assert (summary["task"], summary["split"], summary["episodes"], summary["seed"]) == ("regular", "test", 2, 0)
+    assert (summary["task"], summary["split"], summary["episodes"], summary["seed"]) == ("regular", "validation", 2, 0)
     assert summary["successes"] == sum(row.success for row in rows)
     assert summary["success_rate"] == summary["successes"] / 2
     assert tuple(summary["ci95"]) == pytest.approx(wilson_interval(summary["successes"], 2))
@@ -55,6 +55,16 @@ def test_an_evaluation_holds_what_the_design_promises(
     assert summary["command"].startswith("grasp-eval ") and "--episodes 2" in summary["command"]
     assert summary["versions"]["pybullet"]
     assert {film.row.episode for film in read_films(evaluation)} <= {0, 1}
+
+
+def test_the_test_split_is_told_from_the_one_to_choose_on(
+    objects_folder: Path, command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("--policy", "random", "--objects", objects_folder, "--plan")
+    assert command("grasp-eval", *words).lines == []
+    (line,) = command("grasp-eval", *words, "--split", "test").lines
+    assert line.startswith("--split test: for the one score of a recipe that is frozen") and "validation" in line
 
 
 def test_several_jobs_give_one_table_in_two_formats(workplace: SimpleNamespace) -> None:
@@ -68,7 +78,9 @@ def test_several_jobs_give_one_table_in_two_formats(workplace: SimpleNamespace) 
 
 
 def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -> None:
-    ours, theirs = (Evaluation.load(workplace.out / f"{name}-regular-test-seed0-2").rows() for name in ("mc", "random"))
+    ours, theirs = (
+        Evaluation.load(workplace.out / f"{name}-regular-validation-seed0-2").rows() for name in ("mc", "random")
+    )
     assert [row.object_ids for row in ours] == [row.object_ids for row in theirs]
 
 
@@ -152,7 +164,7 @@ def test_another_job_never_overwrites_an_evaluation_and_a_damaged_one_is_to_do(
     other = command(*plan, "--checkpoint", "2")
     assert other.code == 0 and "to do" in other.out
     assert files_of(out) == files_of(workplace.out)
-    with (out / "mc-regular-test-seed0-2" / "episodes.jsonl").open("a") as file:
+    with (out / "mc-regular-validation-seed0-2" / "episodes.jsonl").open("a") as file:
         file.write("{}\n")
     assert "to do" in command(*plan).out
 
@@ -211,7 +223,7 @@ def test_a_users_policy_is_scored_and_filmed_by_the_same_command(
         (("--policy", "random", "--episodes", "many"), "expected a whole number of at least 1"),
         (("--policy", "random", "--seed", "-1"), "expected a number of at least 0"),
         (("--policy", "random", "--objects", "absent"), "absent/object_set.json: no object set"),
-        (("--policy", "random", "--objects", "OBJECTS", "--split", "validation"), "split 'validation'"),
+        (("--policy", "random", "--objects", "OBJECTS", "--split", "test-clutter"), "split 'test-clutter'"),
         (("--policy", "random", "--objects", "OBJECTS", "--task", "targeted"), "'target'"),
         (("RUN", "--checkpoint", "3"), "no checkpoint of step 3"),
         (("RUN", "--task", "targeted", "--objects", "OBJECTS"), "'target'"),
@@ -265,7 +277,7 @@ def test_another_object_set_than_the_runs_must_be_asked_for(
     (moved / "config.json").write_text(json.dumps(config))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     own = make_procedural(
-        tmp_path / f"graspq/objects/regular-{GENERATOR_VERSION}", seed=SEED, train=5, test=5, validation=0
+        tmp_path / f"graspq/objects/regular-{GENERATOR_VERSION}", seed=SEED, train=5, test=5, validation=5
     )
     done = command("grasp-eval", moved, *SMALL, "--plan")
     assert done.code == 2 and "not the object set of the run's data" in done.lines[0]

@@ -46,12 +46,12 @@ def trained(trial: Trial, step: int, rows: tuple[dict[str, Any], ...] = ()) -> R
 
 def scored(trial: Trial, successes: int, step: int = 100, episodes: int = 10, **changed: Any) -> Path:
     """An evaluation of a trial's run, by the real writers."""
-    place = trial.run_folder / "evaluations" / f"regular-test-seed0-{episodes}-{step}"
+    place = trial.run_folder / "evaluations" / f"regular-validation-seed0-{episodes}-{step}"
     place.mkdir(parents=True)
     rows = [EpisodeRow(index, 0, (), index < successes, None, 4, "height", 0.0, None) for index in range(episodes)]
     write_rows(place, rows)
     summary = {
-        "format_version": FORMAT_VERSION, "task": "regular", "split": "test", "episodes": episodes,
+        "format_version": FORMAT_VERSION, "task": "regular", "split": "validation", "episodes": episodes,
         "successes": successes, "success_rate": successes / episodes,
         "ci95": list(wilson_interval(successes, episodes)), "label": trial.name, "job": {}, "seed": 0,
         "checkpoint_step": step, "cem": CemSettings().to_json(), "policy": "cem",

@@ -63,7 +63,7 @@ def test_a_folder_whose_plan_cannot_be_read_is_refused(text: str, tmp_path: Path
     [
         (("--steps", "101"), "holds a sweep with steps = 100, not 101; choose another --out"),
         (("--episodes", "11"), "holds a sweep with episodes = 200, not 11"),
-        (("--split", "train"), "holds a sweep with split = test, not train"),
+        (("--split", "train"), "holds a sweep with split = validation, not train"),
         (("--preset", "paper", "--steps", "1000"), "holds a sweep with preset = small, not paper"),
     ],
 )

@@ -61,7 +61,7 @@ def test_a_trial_trains_then_is_scored_then_needs_nothing(trials: list[Trial], w
     assert following().startswith("grasp-train ")
     write.trained(trial, 100)
     assert following() == (
-        f"grasp-eval {trial.run_folder} --split test --episodes 10 --seed 0 --workers 2 --device cpu"
+        f"grasp-eval {trial.run_folder} --split validation --episodes 10 --seed 0 --workers 2 --device cpu"
     )
     write.scored(trial, 3)
     assert following() == "None"
