@@ -60,9 +60,14 @@ def training_batches(
 
 
 def batch_items(pool: ShardPool, settings: TrainSettings) -> int:
-    """Return the items of a batch over all ranks: `batch_size` transitions, or episodes with so many on average."""
+    """Return the items of a batch over all ranks: `batch_size` transitions, or episodes with so many on average.
+
+    An estimator of whole episodes may count these instead; a batch is never larger than the pool's episodes.
+    """
     if settings.estimator.target_value.view == "transitions":
         return settings.batch_size
+    if settings.own.counts_episodes:
+        return min(settings.batch_size, max(pool.episodes, 1))
     return max(1, min(round(settings.batch_size * pool.episodes / max(pool.rows, 1)), pool.episodes))
 
 

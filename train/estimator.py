@@ -34,6 +34,11 @@ class EstimatorSettings(Settings):
         """Steps between copies of the weights into lagged networks; None: there are none."""
         return None
 
+    @property
+    def counts_episodes(self) -> bool:
+        """Whether `--batch-size` counts whole episodes, not transitions; read where a batch holds episodes."""
+        return False
+
     def chosen_discount(self, stored: float) -> float:
         """Return γ of the run; `stored` is that of the dataset's own returns."""
         return stored
@@ -123,6 +128,21 @@ class LaggedSettings(EstimatorSettings):
     def chosen_discount(self, stored: float) -> float:
         """Return γ of the targets."""
         return self.discount
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeSettings(EstimatorSettings):
+    """Options of an estimator that trains on whole episodes, in the paper's preset on a number of them."""
+
+    batch_of: Literal["transitions", "episodes"] = setting(
+        "transitions",
+        help="What --batch-size counts: transitions, of as many episodes as have them on average; or those.",
+    )
+
+    @property
+    def counts_episodes(self) -> bool:
+        """Whether `batch_of` says so."""
+        return self.batch_of == "episodes"
 
 
 def chosen_loss(settings: Any) -> Loss:

@@ -69,9 +69,11 @@ def test_images_that_fit_nowhere_are_refused_in_one_line(dataset: Path) -> None:
         ResidentPool.read(dataclasses.replace(pool, blocks=(first, *pool.blocks[1:])), CPU)
 
 
-def test_a_batch_of_episodes_has_about_as_many_transitions(settings: Make, dataset: Path) -> None:
+def test_a_batch_of_episodes_has_about_as_many_transitions_or_so_many_episodes(settings: Make, dataset: Path) -> None:
     pool = open_shards([dataset])
     episodes = batch_items(pool, settings("corr-mc"))
     assert abs(episodes * pool.rows / pool.episodes - 32) < pool.rows / pool.episodes
+    assert batch_items(pool, settings("corr-mc", batch_of="episodes")) == 32
+    assert batch_items(pool, settings("corr-mc", batch_of="episodes", batch_size=10**6)) == pool.episodes
     assert batch_items(pool, settings("mc")) == 32
     assert image_bytes(pool) == pool.rows * 16 * 16 * 3

@@ -27,12 +27,20 @@ COMMON = {
 }
 SQUARED: dict[str, Any] = {"loss": "squared"}  # P, equations
 DOUBLE_Q = SQUARED | {"discount": 0.9, "lag_steps": 50}  # P: every 50 gradient updates
-CORRECTED = SQUARED | {"discount": 0.9, "candidates": 16, "centred": False, "look_in_mirror": False}
+# C: V by double Q over 16 actions; no clamp, no centring.
+CORRECTED = SQUARED | {
+    "discount": 0.9,
+    "candidates": 16,
+    "clamped": False,
+    "centred": False,
+    "look_in_mirror": False,
+}
 OWN: dict[str, dict[str, Any]] = {
     "supervised": SQUARED,
     "dql": DOUBLE_Q | {"candidates": 16},  # P: 16 actions uniformly at random
     "mc": SQUARED | {"discount": None},  # P, footnote; C
-    "corr-mc": CORRECTED | {"lag_steps": 100, "anneal": 0.05},  # C: 100,000 of 2 million steps
+    # C: 100,000 of 2 million steps; the advantage's Q is the trained network's, gradient and all; 32 episodes.
+    "corr-mc": CORRECTED | {"lag_steps": 100, "anneal": 0.05, "judge": "online-gradient", "batch_of": "episodes"},
     "ddpg": DOUBLE_Q | {"actor_rest": 0.0, "actor_rate": 1.0, "actor_every": 1},
     # Configuration of the authors' Trust-PCL for grasping.
     "pcl": {
@@ -42,8 +50,9 @@ OWN: dict[str, dict[str, Any]] = {
         "path_steps": 10,
         "penalty": 3.0,
         "kl_bound": 0.02,
+        "batch_of": "episodes",
     },
-    "blend": CORRECTED | {"lag_steps": 50},  # not the paper's: as its parents
+    "blend": CORRECTED | {"lag_steps": 50, "judge": "lagged"},  # not the paper's: as its parents
 }
 RECIPES: dict[str, dict[str, Any]] = {
     "corr-mc": {"learning_rate": 1e-4},

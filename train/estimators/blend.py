@@ -9,9 +9,11 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from graspq.common.errors import UserError
+from graspq.common.options import setting
 from graspq.datasets.pool import ShardPool
 from graspq.train.acting import StochasticSearch
-from graspq.train.advantages import CorrectionSettings, LaggedValues, advantages, lagged_values
+from graspq.train.advantages import CorrectionSettings, Judge, LaterValues, advantages, later_values
 from graspq.train.batch import Batch
 from graspq.train.estimator import Estimator, Metrics, TargetValue, step_towards
 from graspq.train.state import Networks, TrainState
@@ -25,6 +27,18 @@ DECAY = 1 - 1 / 50
 @dataclasses.dataclass(frozen=True)
 class BlendSettings(CorrectionSettings):
     """Options of `blend`."""
+
+    judge: Judge = setting("lagged", help="Whose Q of the logged action an advantage takes: online or lagged.")
+
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UserError: a value is out of range, or a gradient is asked for that the update does not take.
+        """
+        super().__post_init__()
+        if self.judge == "online-gradient":
+            raise UserError("--judge online-gradient: expected online or lagged with --algo blend")
 
 
 def nothing_measured(pool: ShardPool, settings: BlendSettings) -> dict[str, Tensor]:
@@ -78,12 +92,12 @@ def target(
     batch: Batch, networks: Networks, settings: BlendSettings, random: torch.Generator, progress: float
 ) -> Tensor:
     """Return the targets with λ as it was measured so far; float [B, T]. See `targets.blended`."""
-    values = lagged_values(batch, networks, settings, random)
+    values = later_values(batch, networks, settings, random)
     return _target(batch, networks, settings, values, advantages(batch, values, 1.0, settings))
 
 
 def _target(
-    batch: Batch, networks: Networks, settings: BlendSettings, values: LaggedValues, advantage: Tensor
+    batch: Batch, networks: Networks, settings: BlendSettings, values: LaterValues, advantage: Tensor
 ) -> Tensor:
     later = batch.later_steps
     weight = torch.zeros_like(batch.reward)
@@ -103,7 +117,7 @@ def measured_regression(
     networks = state.networks
     networks.q.eval()
     with torch.no_grad(), networks.autocast():
-        values = lagged_values(batch, networks, settings, random)
+        values = later_values(batch, networks, settings, random)
         advantage = advantages(batch, values, 1.0, settings)
         later = batch.later_steps
         corrected = corrected_episode_value(batch.reward, advantage, 1.0, settings.discount, batch.mask)
@@ -124,7 +138,7 @@ row = Estimator(
         needs_return=False,
     ),
     action_selection=StochasticSearch(),
-    paper=BlendSettings(loss="squared", centred=False, look_in_mirror=False),
+    paper=BlendSettings(loss="squared", look_in_mirror=False),
     update=measured_regression,
     kept=nothing_measured,
 )

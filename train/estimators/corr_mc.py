@@ -1,6 +1,6 @@
-"""`corr-mc`: the return that the episode really had, less what its later actions were worth against the best (≤ 0).
+"""`corr-mc`: the return that the episode really had, less what its later actions were worth against the best.
 
-Dimensions: B batch, T steps. Measurements and why it departs from the paper: docs/estimators/corr-mc.md.
+Dimensions: B batch, T steps, n real steps. Derivation, variants and measurements: docs/estimators/corr-mc.md.
 """
 
 import dataclasses
@@ -8,23 +8,35 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.train.acting import StochasticSearch
-from graspq.train.advantages import CorrectionSettings, advantages, lagged_values
+from graspq.train.advantages import CorrectionSettings, LaterValues, advantages, later_values
 from graspq.train.batch import Batch
-from graspq.train.estimator import Estimator, TargetValue
+from graspq.train.estimator import EpisodeSettings, Estimator, Metrics, TargetValue, regression
 from graspq.train.recipe import PAPER
-from graspq.train.state import Networks
+from graspq.train.state import Networks, TrainState
 from graspq.train.targets import corrected_episode_value
 
 
 @dataclasses.dataclass(frozen=True)
-class CorrMcSettings(CorrectionSettings):
+class CorrMcSettings(CorrectionSettings, EpisodeSettings):
     """Options of `corr-mc`."""
 
     anneal: float = setting(
-        1.0, help="Part of the steps over which nu rises from 0 to 1; 0: all at once.", minimum=0, maximum=1
+        0.5, help="Part of the steps over which nu rises from 0 to 1; 0: all at once.", minimum=0, maximum=1
     )
+
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UserError: a value is out of range, or the gradient of a loss is asked for that has no use for it.
+        """
+        super().__post_init__()
+        if self.judge == "online-gradient" and self.loss != "squared":
+            # The slope of the cross-entropy in its target does not vanish where the target is met.
+            raise UserError(f"--judge online-gradient: expected --loss squared, got --loss {self.loss}")
 
 
 def target(
@@ -33,21 +45,59 @@ def target(
     """Return the observed return minus ν times the later advantages; see `targets.corrected_episode_value`; [B, T].
 
     Source: Quillen et al. 2018, section "Corrected Monte Carlo Evaluation".
-    Differs: 1. V(s) is the lagged network's Q of the best of N uniform actions and the logged one, or that of the
-    logged one where this is larger: no advantage is above 0 before they are centred. 2. θ picks the best, on the mirror
-    image (`--no-look-in-mirror` with `--preset paper`), and θ' judges it. 3. Advantages are constants of the loss; the
-    released code lets gradient through them. 4. They are centred (`--no-centred` with `--preset paper`). 5. ν rises
-    over the whole training, over a twentieth with `--preset paper`, which is the released code's 100,000 of 2 million
-    steps; the text says "during training". 6. A batch counts transitions; in the released code 32 counts episodes.
+    Differs: 1. Q of an advantage is a constant of the loss; the released code lets gradient through it (`--judge
+    online-gradient`, with `--preset paper`). 2. θ looks at the mirror image where it picks and judges
+    (`--no-look-in-mirror` with `--preset paper`). 3. ν rises over half of the training; over a twentieth with `--preset
+    paper`, which is the released code's 100,000 of 2 million steps; the text says "during training". 4. A batch counts
+    transitions; in the released code 32 counts episodes (`--batch-of episodes`, with `--preset paper`). 5. The lagged
+    network is copied every 50 steps, the paper's text for `dql`; every 100 in the released code, and with `--preset
+    paper`.
     """
+    return _target(batch, later_values(batch, networks, settings, random), settings, progress)
+
+
+def _target(batch: Batch, values: LaterValues, settings: CorrMcSettings, progress: float) -> Tensor:
     nu = annealed(progress, settings.anneal)
-    advantage = advantages(batch, lagged_values(batch, networks, settings, random), nu, settings)
+    advantage = advantages(batch, values, nu, settings)
     return corrected_episode_value(batch.reward, advantage, nu, settings.discount, batch.mask)
 
 
 def annealed(progress: float, part: float) -> float:
     """Return ν = min(progress / part, 1): from 0 to 1 over the first `part` of the training; 1 where that is 0."""
     return min(progress / part, 1.0) if part > 0 else 1.0
+
+
+def corrected_regression(
+    estimator: Estimator[CorrMcSettings],
+    state: TrainState,
+    batch: Batch,
+    settings: CorrMcSettings,
+    random: torch.Generator,
+    progress: float,
+) -> Metrics:
+    """Take one step of regression; with `--judge online-gradient` down the gradient of the targets' Q as well.
+
+        θ ← θ - optimiser(∇_θ mean ½ (Q_θ(s_t, a_t) - y_t(θ))²),
+        y_t(θ) = R_t - ν Σ_{t'=t+1}^{T} γ^{t'-t} (Q_θ(s_t', a_t') - V(s_t'))
+
+    Q_θ of the advantages is that of the same pass; V is a constant.
+
+    Source: released code, `random_continuous_pcl_graph`.
+    """
+    if settings.judge != "online-gradient":
+        return regression(estimator, state, batch, settings, random, progress)
+    networks = state.networks
+    networks.q.eval()
+    with torch.no_grad(), networks.autocast():
+        values = later_values(batch, networks, settings, random)
+    networks.q.train()
+    with networks.autocast():
+        output = networks.q(batch.real(batch.image), batch.real(batch.step), batch.real(batch.action)).float()
+    q = networks.q.value_of(output)
+    wanted = batch.real(_target(batch, values._replace(q=batch.in_place(q)), settings, progress))
+    loss = estimator.loss(settings).of(output, wanted).mean()
+    state.descend("q", loss)
+    return {"loss": loss.detach(), "q": q.detach().abs().mean(), "target": wanted.detach().abs().mean()}
 
 
 row = Estimator(
@@ -57,6 +107,9 @@ row = Estimator(
         "corrected episode value, coefficient nu annealed 0 -> 1", target, view="episodes", needs_return=False
     ),
     action_selection=StochasticSearch(),
-    paper=CorrMcSettings(loss="squared", lag_steps=100, anneal=0.05, centred=False, look_in_mirror=False),
+    paper=CorrMcSettings(
+        loss="squared", lag_steps=100, anneal=0.05, judge="online-gradient", look_in_mirror=False, batch_of="episodes"
+    ),
     paper_recipe=dataclasses.replace(PAPER, learning_rate=1e-4),
+    update=corrected_regression,
 )

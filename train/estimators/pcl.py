@@ -14,7 +14,7 @@ from graspq.common.options import setting
 from graspq.datasets.pool import ShardPool
 from graspq.train.acting import ActorNetwork
 from graspq.train.batch import Batch
-from graspq.train.estimator import LOSSES, Estimator, LaggedSettings, Metrics, TargetValue
+from graspq.train.estimator import LOSSES, EpisodeSettings, Estimator, LaggedSettings, Metrics, TargetValue
 from graspq.train.networks import state_network
 from graspq.train.recipe import PAPER
 from graspq.train.selection import pointed
@@ -30,7 +30,7 @@ STATISTICS_STATES = 64
 
 
 @dataclasses.dataclass(frozen=True)
-class PclSettings(LaggedSettings):
+class PclSettings(LaggedSettings, EpisodeSettings):
     """Options of `pcl`."""
 
     actor_rate: float = setting(0.1, help="Learning rate of the actor over that of V.", minimum=0, maximum=10)
@@ -107,7 +107,8 @@ def target(batch: Batch, networks: Networks, settings: PclSettings, random: torc
     5. The deviation is learned, between 0.1 and 1; theirs is fixed. 6. The mean lies within 1.25 times the box. 7. Both
     policies run with the same running statistics, see `_share_statistics`. 8. Gradients of π are divided by λ, see
     `path_consistency`. 9. The policy's rate is a tenth of V's (1 with `--preset paper`). 10. The step is in the state.
-    11. With `--path-steps`, V(s_{t+d}) is of the same pass as V(s_t).
+    11. With `--path-steps`, V(s_{t+d}) is of the same pass as V(s_t). 12. A batch counts transitions (their 64 counts
+    episodes; `--batch-of episodes`, with `--preset paper`).
     """
     return _value_and_target(batch, networks, settings)[1]
 
@@ -238,7 +239,7 @@ row = Estimator(
         needs_return=False,
     ),
     action_selection=ActorNetwork(),
-    paper=PclSettings(discount=0.95, actor_rate=1.0, path_steps=10, penalty=3.0),
+    paper=PclSettings(discount=0.95, actor_rate=1.0, path_steps=10, penalty=3.0, batch_of="episodes"),
     paper_recipe=dataclasses.replace(PAPER, learning_rate=1e-4, batch_size=64),
     loss=lambda settings: LOSSES["squared"],
     parts={"v": state_network(1), "actor": state_network(lambda specification: 2 * specification.actions)},

@@ -5,15 +5,16 @@ from typing import Any
 import pytest
 import torch
 from plain import plain_networks
-from torch import Tensor
+from torch import Tensor, nn
 
-from graspq.train.advantages import LaggedValues, advantages, lagged_values
+from graspq.common.errors import UserError
+from graspq.train.advantages import LaterValues, advantages, later_values
 from graspq.train.batch import Batch
 from graspq.train.estimator import cross_entropy
-from graspq.train.estimators.corr_mc import CorrMcSettings, annealed, target
+from graspq.train.estimators.corr_mc import CorrMcSettings, annealed, row, target
 from graspq.train.networks.network import Features, QNetwork
 from graspq.train.selection import uniform_actions
-from graspq.train.state import Networks, seeded
+from graspq.train.state import Networks, TrainState, seeded
 from graspq.train.targets import corrected_episode_value
 
 MASK = torch.tensor([[True, True, True], [True, False, False], [True, True, False]])
@@ -45,12 +46,12 @@ def networks(lagged: QNetwork, network: QNetwork | None = None) -> Networks:
 
 
 def settings(**given: Any) -> CorrMcSettings:
-    plain: dict[str, Any] = {"anneal": 0.5, "centred": False, "look_in_mirror": False}
+    plain: dict[str, Any] = {"look_in_mirror": False}
     return CorrMcSettings(**plain | given)
 
 
-def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> LaggedValues:
-    return lagged_values(batch, given, chosen, seeded("tests/draws"))
+def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> LaterValues:
+    return later_values(batch, given, chosen, seeded("tests/draws"))
 
 
 def sampled_advantage(batch: Batch, given: Networks, chosen: CorrMcSettings) -> Tensor:
@@ -76,18 +77,57 @@ def episodes(mask: Tensor = MASK) -> Batch:
     )
 
 
-def test_advantages_are_against_the_best_of_the_candidates_and_the_logged_action() -> None:
-    lagged, batch = Peak(), episodes()
-    advantage = sampled_advantage(batch, networks(lagged), settings())
+def later_draws(candidates: int = 16) -> Tensor:
+    """Return the candidates' dx at the three later steps of `episodes()`, [3, N]."""
     generator = seeded("tests/draws")
-    by_step = torch.stack([uniform_actions(generator, 3, 16, 4)[..., 0].abs().amin(1) for _ in range(3)], dim=1)
-    drawn = torch.stack([by_step[0, 1], by_step[0, 2], by_step[2, 1]])
-    logged = torch.stack([batch.action[0, 1, 0], batch.action[0, 2, 0], batch.action[2, 1, 0]]).abs()
-    expected = torch.minimum(logged, drawn) - logged
-    read = torch.stack([advantage[0, 1], advantage[0, 2], advantage[2, 1]])
-    torch.testing.assert_close(read, expected, rtol=0, atol=1e-6)
-    assert bool((read <= 0).all()) and float(read.min()) < -0.1
-    assert int(advantage.isnan().sum()) == 6, "nothing else is computed"
+    by_step = torch.stack([uniform_actions(generator, 3, candidates, 4)[..., 0] for _ in range(3)], dim=1)
+    return torch.stack([by_step[0, 1], by_step[0, 2], by_step[2, 1]])
+
+
+def at_later(values: Tensor) -> Tensor:
+    return torch.stack([values[0, 1], values[0, 2], values[2, 1]])
+
+
+class Tilted(Peak):
+    """Q(s, a) = factor · dx."""
+
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor = factor
+
+    def head(self, features: Features, action: Tensor) -> Tensor:
+        return self.factor * action[..., 0]
+
+
+@pytest.mark.parametrize("judge", ["online", "lagged"])
+def test_v_is_the_online_networks_pick_of_the_uniform_actions_as_the_lagged_one_judges_it(judge: str) -> None:
+    batch = episodes()
+    seen = seen_by(batch, networks(Tilted(-10.0), Tilted(3.0)), settings(judge=judge))
+    logged, drawn = at_later(batch.action[..., 0]), later_draws()
+    torch.testing.assert_close(at_later(seen.value), -10 * drawn.amax(1))
+    torch.testing.assert_close(at_later(seen.q), (3 if judge == "online" else -10) * logged)
+    assert int(seen.value.isnan().sum()) == int(seen.q.isnan().sum()) == 6, "nothing else is computed"
+
+
+@pytest.mark.parametrize("judge", ["online", "lagged"])
+def test_advantages_are_not_clamped_and_a_good_logged_action_has_one_above_zero(judge: str) -> None:
+    batch = episodes()
+    batch.action[0, 1, 0] = 0.0
+    found = at_later(sampled_advantage(batch, networks(Peak()), settings(judge=judge, candidates=1)))
+    expected = later_draws(1)[:, 0].abs() - at_later(batch.action[..., 0]).abs()
+    torch.testing.assert_close(found, expected)
+    assert float(found[0]) > 0.1 and float(found.min()) < -0.1
+
+
+def test_clamped_advantages_are_against_the_best_of_the_candidates_and_the_logged_action() -> None:
+    batch = episodes()
+    for judge in ("online", "lagged"):
+        advantage = sampled_advantage(batch, networks(Peak()), settings(clamped=True, judge=judge))
+        logged, drawn = at_later(batch.action[..., 0]).abs(), later_draws().abs().amin(1)
+        torch.testing.assert_close(at_later(advantage), torch.minimum(logged, drawn) - logged, rtol=0, atol=1e-6)
+    # The lagged network thinks the reverse of the online one, which then picks the worst: the logged one is above it.
+    seen = seen_by(batch, networks(Tilted(-1.0), Tilted(1.0)), settings(clamped=True, judge="lagged", candidates=1))
+    assert torch.equal(at_later(seen.value), at_later(seen.q))
 
 
 def test_both_trunks_run_once_for_each_state_that_is_read() -> None:
@@ -143,36 +183,87 @@ def test_in_the_mirror_a_symmetric_q_picks_the_same_and_a_network_that_knows_no_
     mirrored = seen_by(batch, networks(Side(), Side()), settings(look_in_mirror=True))
     torch.testing.assert_close(mirrored.value, plain.value, equal_nan=True)
     other = seen_by(batch, networks(Side(), Blind()), settings(look_in_mirror=True))
-    # It picks the candidate that is the worst here; then the logged action is at least as good.
-    assert torch.equal(other.value[MASK][[1, 2, 5]], other.q[MASK][[1, 2, 5]])
-    assert bool((plain.value > other.value)[MASK][[1, 2, 5]].any())
+    # It picks the candidate that is the worst here, and judges the logged action the other way round.
+    assert bool((plain.value > other.value)[MASK][[1, 2, 5]].all())
+    torch.testing.assert_close(at_later(other.q), -at_later(batch.action[..., 1]))
+    torch.testing.assert_close(at_later(mirrored.q), at_later(plain.q))
 
 
 @pytest.mark.parametrize(
-    ("picker", "values", "expected"),
-    [(0, 2, 0.5642), (0, 17, 1.7940), (1, 2, 0.5642 * 1 / 2), (1, 17, 0.5642 * 16 / 17)],
-    ids=["its own of 2", "its own of 17", "another's of 2", "another's of 17"],
+    ("picker", "clamped", "expected"),
+    [(1, False, 0.0), (1, True, 0.5642 * 16 / 17), (0, False, 1.7660), (0, True, 1.7940)],
+    ids=["another's pick", "another's, clamped", "its own maximum", "its own, clamped"],
 )
-def test_the_best_of_noisy_values_is_judged_too_high_by_what_order_statistics_say(
-    picker: int, values: int, expected: float
+def test_v_of_noisy_values_is_right_by_double_q_and_too_high_where_it_is_clamped_or_judged_by_the_picker(
+    picker: int, clamped: bool, expected: float
 ) -> None:
     """All actions are equally good, so every true advantage is 0: what is measured is bias, in deviations of noise.
 
-    One network's own maximum over n values is too high by the expected maximum of n standard normal numbers; picked by
-    another network, by that of two, the pick and the logged action, where these are two.
+    One network's own maximum over n values is too high by the expected maximum of n standard normal numbers; clamped,
+    another's pick is too high by that of two, the pick and the logged action, where these are two.
     """
     batch = episodes(torch.ones(4000, 6, dtype=torch.bool))
     given = networks(Peak(deviation=0.1), Peak(deviation=0.1, seed=picker))
-    bias = -float(sampled_advantage(batch, given, settings(candidates=values - 1))[:, 1:].mean()) / 0.1
-    assert bias == pytest.approx(expected, abs=0.02)
+    chosen = settings(clamped=clamped, judge="lagged")
+    bias = -float(sampled_advantage(batch, given, chosen)[:, 1:].mean()) / 0.1
+    assert bias == pytest.approx(expected, abs=0.025)
 
 
-def judged_at_random(mask: Tensor) -> LaggedValues:
+def judged_at_random(mask: Tensor) -> LaterValues:
     generator = seeded("tests/judged")
     q, value = torch.rand(2, *mask.shape, generator=generator)
     unread = ~mask | (torch.arange(mask.shape[1]) == 0)
     q = torch.where(unread, torch.nan, q)
-    return LaggedValues(torch.where(unread, torch.nan, torch.maximum(q, value)), q)
+    return LaterValues(torch.where(unread, torch.nan, torch.maximum(q, value)), q)
+
+
+class Table(Peak):
+    """Q(s, a) = a weight of the step, the same for all actions."""
+
+    def __init__(self, *values: float) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(values))
+
+    def trunk(self, image: Tensor, step: Tensor) -> Features:
+        return (self.weight[step],)
+
+    def head(self, features: Features, action: Tensor) -> Tensor:
+        return features[0].unsqueeze(1).expand(action.shape[:2])
+
+
+def stepped(chosen: CorrMcSettings, progress: float = 1.0) -> Tensor:
+    """Return by how much one step of gradient descent at rate 1 changes the weights of a table, [T]."""
+    network, lagged = Table(0.5, 0.25, -0.5), Table(0.3, 0.6, 0.9)
+    state = TrainState(0, networks(lagged, network), {}, {"q": torch.optim.SGD(network.parameters(), lr=1.0)})  # type: ignore[dict-item]
+    before, batch = network.weight.detach().clone(), episodes()
+    metrics = row.update(row, state, batch, chosen, seeded("tests/draws"), progress)
+    assert set(metrics) == {"loss", "q", "target"} and not any(value.requires_grad for value in metrics.values())
+    return network.weight.detach() - before
+
+
+def test_the_papers_step_goes_down_the_gradient_of_the_target_and_the_default_step_does_not() -> None:
+    table, v = torch.tensor([0.5, 0.25, -0.5], dtype=torch.float64, requires_grad=True), (0.3, 0.6, 0.9)
+    losses, fixed = [], []
+    for length in (3, 1, 2):
+        for t in range(length):
+            after = range(t + 1, length)
+            returns = sum(0.9 ** (k - t) * (k + 1) for k in range(t, length))
+            later = sum((0.9 ** (k - t) * (table[k] - v[k]) for k in after), torch.tensor(0.0))
+            losses.append(0.5 * (table[t] - (returns - later)) ** 2)
+            fixed.append(0.5 * (table[t] - (returns - later.detach())) ** 2)
+    for judge, expected in (("online-gradient", losses), ("online", fixed)):
+        (gradient,) = torch.autograd.grad(torch.stack(expected).mean(), table, retain_graph=True)
+        chosen = settings(judge=judge, loss="squared", anneal=0.0)
+        torch.testing.assert_close(stepped(chosen), -gradient.float(), rtol=0, atol=1e-5)
+    # At the start of training there is no correction, and nothing to go through.
+    assert torch.equal(
+        stepped(settings(judge="online-gradient", loss="squared"), 0.0), stepped(settings(loss="squared"), 0.0)
+    )
+
+
+def test_the_gradient_of_targets_is_refused_with_a_loss_whose_slope_there_never_vanishes() -> None:
+    with pytest.raises(UserError, match="--judge online-gradient: expected --loss squared, got --loss cross-entropy"):
+        CorrMcSettings(judge="online-gradient")
 
 
 def test_centred_targets_are_on_average_those_of_bootstrapping_and_keep_the_differences_between_episodes() -> None:
@@ -200,7 +291,7 @@ def test_centring_changes_nothing_where_the_lagged_network_is_right_on_average()
         wanted = corrected_episode_value(batch.reward, q - seen.value, 0.7, 0.9, mask)
         q = q.clone()
         q[:, t] += (wanted - q)[:, t][mask[:, t]].mean()
-    right = LaggedValues(seen.value, q)
+    right = LaterValues(seen.value, q)
     plain = q - seen.value
     torch.testing.assert_close(
         advantages(batch, right, 0.7, settings(centred=True)), plain, equal_nan=True, rtol=0, atol=1e-6
