@@ -6,6 +6,7 @@ SEED ?= 0
 TORCH_INDEX ?=
 TEST_WORKERS ?= 2
 BENCH ?=
+PLAN ?= studies/plans/10k.toml
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -15,7 +16,7 @@ QUICK := runs/quickstart
 QUICK_STEPS := 700
 export PYTHONUNBUFFERED := 1
 
-.PHONY: help setup quickstart test python-versions lint types data bench clean
+.PHONY: help setup quickstart test python-versions lint types data bench study clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 17
@@ -52,6 +53,9 @@ bench: setup ## every published ratio: results/bench.json and the table in RESUL
 	$(if $(wildcard data/regular-10k/manifest.json),,$(BIN)/grasp-datagen --size 10k --out data/regular-10k)
 	$(if $(wildcard runs/mc-regular-10k-seed0/config.json),,$(BIN)/grasp-train --algo mc --shards data/regular-10k)
 	$(BIN)/python benchmarks/bench.py $(BENCH)
+
+study: setup ## train, score and judge every row of PLAN=studies/plans/10k.toml (goes on where it was stopped)
+	$(BIN)/grasp-study run '$(PLAN)'
 
 test: setup lint types ## everything that CI checks (at most 10 minutes)
 	$(BIN)/python -P -m pytest -n $(TEST_WORKERS) --dist loadfile

@@ -19,6 +19,7 @@ MODULES = {
     "grasp-train": "graspq.train.cli",
     "grasp-online": "graspq.studies.online.cli",
     "grasp-eval": "graspq.evaluate.cli",
+    "grasp-datagen": "graspq.datagen.cli",
 }
 PRESET = "paper"  # of the training command, where the sweep does not vary it
 

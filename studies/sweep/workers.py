@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from graspq.common.errors import UserError
 from graspq.common.files import cache_folder, read_json, write_json
@@ -21,16 +22,21 @@ from graspq.studies.sweep.checks import objects_beside
 from graspq.studies.sweep.settings import SweepSettings
 from graspq.studies.sweep.trial import Trial, run_in, trained_steps
 
+T = TypeVar("T", bound=Trial)
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-def hand_out(trials: Sequence[Trial]) -> Generator[tuple[Trial, str | None], None, None]:
-    """Have trials of one sweep done, and yield each with why it failed; see `engine.plan.HandOut`."""
+def hand_out(trials: Sequence[T]) -> Generator[tuple[T, str | None], None, None]:
+    """Have trials done, and yield each with why it failed; see `engine.plan.HandOut`.
+
+    Their settings differ at most in what is learned from and how long: folder, engine and threads are the same.
+    """
     settings = trials[0].settings
     threads, travels = settings.threads or 1, settings.engine == "ray" and settings.workers != 0
-    paths = dict.fromkeys(ref.path.absolute() for ref in open_shards(settings.shards, verify=False).blocks)
-    work = Trials(settings, travels, tuple(paths))
+    named = dict.fromkeys(trial.settings.shards for trial in trials)
+    work = Trials(settings, travels, {shards: _files_of(shards) for shards in named})
     # Each is packed when a worker is free for it.
+    of_name = {trial.name: trial for trial in trials}
     parcels = (Parcel.of(trial) if travels else Parcel(trial) for trial in trials)
     # One a worker: what the trial before it left in memory does not matter.
     ended = run(
@@ -42,12 +48,12 @@ def hand_out(trials: Sequence[Trial]) -> Generator[tuple[Trial, str | None], Non
             for parcel, (error, content) in found:
                 if content is not None:
                     unpack_parts(content, settings.folder, parcel.trial.outputs)
-                yield parcel.trial, error
+                yield of_name[parcel.trial.name], error
     except LostUnitsError as lost:
         for parcel, how in lost.lost:
             reason = f"ended its worker twice ({how})"
             parcel.trial.note_failure("", 1, reason)
-            yield parcel.trial, reason
+            yield of_name[parcel.trial.name], reason
 
 
 @dataclass(frozen=True)
@@ -70,19 +76,19 @@ class Trials:
     """How trials are done; the `Work` of a sweep. Gives why a trial failed, and where it travels what it made, packed.
 
     Attributes:
-        settings: of the sweep.
+        settings: of one of the trials, for what they have in common.
         travels: whether trials travel, and with them what they are made from.
-        shards: files of the steps.
+        shards: files of the steps, by what the settings of a trial call them.
     """
 
     settings: SweepSettings
     travels: bool
-    shards: tuple[Path, ...]
+    shards: dict[tuple[str, ...], tuple[Path, ...]]
 
     @property
     def datasets(self) -> list[Path]:
         """Folders that the shards lie in."""
-        return list(dict.fromkeys(path.parent.parent for path in self.shards))
+        return list(dict.fromkeys(path.parent.parent for paths in self.shards.values() for path in paths))
 
     def folders(self) -> Sequence[Path]:
         """Return the datasets and the object set."""
@@ -99,22 +105,29 @@ class Trials:
         """Do a trial in a folder of this machine; one that a killed worker has left here is gone on with."""
         ours = hashlib.sha256(str(self.settings.folder).encode()).hexdigest()[:16]
         folder = cache_folder("sweeps", f"{ours}-{parcel.trial.name}")
-        datasets, objects = [place(home) for home in self.datasets], self.settings.objects
-        shards = [place(path.parent.parent) / path.relative_to(path.parent.parent) for path in self.shards]
+        own = parcel.trial.settings
+        homes = {path: path.parent.parent for path in self.shards[own.shards]}
+        shards = [place(home) / path.relative_to(home) for path, home in homes.items()]
+        datasets = [place(home) for home in dict.fromkeys(homes.values())]
         moved = dataclasses.replace(
-            self.settings,
+            own,
             out=folder,
             shards=tuple(map(str, shards)),
-            objects=place(objects) if objects is not None else objects_beside(datasets),
+            objects=place(own.objects) if own.objects is not None else objects_beside(datasets),
         )
         trial = dataclasses.replace(parcel.trial, settings=moved)
         if parcel.content is not None and parcel.steps >= trained_steps(run_in(trial.run_folder)):
             unpack_parts(parcel.content, folder, trial.outputs)
         error = _error(trial)
-        _name_shards(trial.run_folder / "config.json", self.settings.shards)
+        _name_shards(trial.run_folder / "config.json", own.shards)
         content = Parcel.of(trial).content or b""
         shutil.rmtree(folder, ignore_errors=True)
         return error, content
+
+
+def _files_of(shards: tuple[str, ...]) -> tuple[Path, ...]:
+    """Return the files of the steps that a trial learns from."""
+    return tuple(dict.fromkeys(ref.path.absolute() for ref in open_shards(shards, verify=False).blocks))
 
 
 def _error(trial: Trial) -> str | None:

@@ -1,0 +1,1 @@
+"""`grasp-study`: a comparison of estimators from a plan in a file, its recipe frozen, its scores in one table."""

@@ -1,0 +1,141 @@
+"""A cell of a study's table, a unit of its plan: one row trained on one dataset with one seed, and scored."""
+
+import functools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.machine import available_cores
+from graspq.common.named_objects import source_digest
+from graspq.common.options import given_options
+from graspq.evaluate.records import identity_digest
+from graspq.studies.study.plan_file import Row, StudyPlan
+from graspq.studies.sweep.commands import CommandLine, training_options
+from graspq.studies.sweep.settings import SweepSettings
+from graspq.studies.sweep.trial import Trial
+from graspq.train.search_settings import CemSettings
+from graspq.train.settings import FREE, complete
+
+# What tells runs of one recipe apart, and what does not decide what is learned.
+NOT_OF_A_RECIPE = FREE | {"seed"}
+
+
+@dataclass(frozen=True)
+class Cell(Trial):
+    """One training and its evaluation; `settings` are those of a trial, here of this cell's row and dataset.
+
+    Attributes:
+        row: name of the row.
+        task: name of the task.
+        size: size of the dataset, as the plan writes it.
+    """
+
+    row: str
+    task: str
+    size: str
+
+    @property
+    def name(self) -> str:
+        """Row, dataset and seed: `mc-regular-10k-seed0`."""
+        parts = (self.row, self.task, self.size, f"seed{self.seed}")
+        return "-".join(re.sub(r"[^A-Za-z0-9._+-]+", ".", part) for part in parts)
+
+    def training_command(self) -> CommandLine:
+        """Return the command that trains to the last step, from where it is.
+
+        Raises:
+            UserError: the row has no such option.
+        """
+        known = training_options(self.algo, self.settings.on_policy, self.options)
+        for name, _ in self.options:
+            if name not in known:
+                raise UserError(f"{self.row}: no option {name} of training with {self.algo}; see grasp-train --help")
+        return super().training_command()
+
+    @functools.cached_property
+    def deciding(self) -> dict[str, Any]:
+        """What decides what is learned and how it acts, but for data and seed, as JSON.
+
+        Raises:
+            UserError: the row has no such option, or a value is out of range.
+        """
+        command = self.training_command()
+        given = given_options(command.main.make_context(command.script, list(command.arguments)))
+        found: dict[str, Any] = {"search": CemSettings().to_json()}
+        if self.settings.on_policy:
+            # Imported late: it needs the simulator.
+            from graspq.studies.online.resolve import resolve
+
+            plan = resolve(given)
+            training = plan.train
+            found["online"] = {name: value for name, value in plan.described().items() if name != "split_seed"}
+        else:
+            training = complete({name: value for name, value in given.items() if name != "preset"}, given["preset"])
+        found["training"] = of_a_recipe(training.to_json())
+        own = [name for name in (training.algo, training.network) if ":" in name]
+        return found | ({"sources": {name: source_digest(name) for name in own}} if own else {})
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of `deciding`, which stands beside the score."""
+        return identity_digest(self.deciding)
+
+
+def of_a_recipe(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of a run's settings that decides what is learned, but for data and seed."""
+    return {name: value for name, value in settings.items() if name not in NOT_OF_A_RECIPE}
+
+
+def cells_of(plan: StudyPlan, folder: Path, *, workers: int | None = None, device: str = "auto") -> list[Cell]:
+    """Return the cells of a plan in the order in which they are done.
+
+    Seed by seed, so that a study that is stopped has whole columns; of one seed the longest trainings first, else in
+    the plan's order.
+
+    Args:
+        plan: the plan.
+        folder: of the study.
+        workers: how many trainings run at a time; the plan's number, else one a core, where not given.
+        device: where networks run.
+    """
+    columns = [(row, task, size) for task in plan.values["tasks"] for size in plan.sizes for row in plan.rows]
+    columns.sort(key=lambda column: -column[0].steps)
+    found = []
+    for seed in range(plan.values["seeds"]):
+        for row, task, size in columns:
+            settings = _settings(plan, folder, row, plan.dataset(task, size), workers, device)
+            found.append(Cell(settings, row.algo, row.options, seed, row.name, task, size))
+    return found
+
+
+def _settings(
+    plan: StudyPlan, folder: Path, row: Row, dataset: Path, workers: int | None, device: str
+) -> SweepSettings:
+    values, threads = plan.values, plan.values["threads"]
+    asked = workers if workers is not None else values["workers"]
+    local = values["engine"] == "local"
+    return SweepSettings(
+        preset="paper" if plan.on_policy else "small",
+        shards=(str(dataset),),
+        split=plan.split,
+        seeds=values["seeds"],
+        steps=row.steps,
+        episodes=values["episodes"],
+        device=device,  # type: ignore[arg-type]
+        engine=values["engine"],
+        ray_address=values["ray_address"],
+        workers=asked if asked is not None or not local else max(available_cores() // threads, 1),
+        threads=threads,
+        out=folder,
+    ).complete()
+
+
+def by_dataset(cells: Sequence[Cell]) -> dict[tuple[str, str], list[Cell]]:
+    """Return the cells by task and size."""
+    found: dict[tuple[str, str], list[Cell]] = {}
+    for cell in cells:
+        found.setdefault((cell.task, cell.size), []).append(cell)
+    return found

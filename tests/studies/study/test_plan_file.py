@@ -1,0 +1,60 @@
+"""A plan in a file: rows that are multiplied out, and one line for every mistake."""
+
+from pathlib import Path
+
+import pytest
+
+from graspq.common.errors import UserError
+from graspq.studies.study.plan_file import read_plan
+
+PLANS = Path(__file__).resolve().parents[3] / "studies" / "plans"
+
+
+def test_lists_of_options_are_multiplied_out_and_name_their_rows(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(
+        "sizes = ['10k']\noptions = {shift = 2}\n"
+        "rows = ['mc', {algo = 'dql', learning_rate = [0.001, 1e-4], mirror = false},"
+        " {algo = 'mc', name = 'long', steps = '8k'}]"
+    )
+    rows = read_plan(tmp_path / "a.toml").rows
+    assert [(row.name, row.algo, row.steps) for row in rows] == [
+        ("mc", "mc", 3000),
+        ("dql-learningrate0.001-mirrorfalse", "dql", 3000),
+        ("dql-learningrate0.0001-mirrorfalse", "dql", 3000),
+        ("long", "mc", 8000),
+    ]
+    assert dict(rows[1].options) == {"preset": "default", "shift": "2", "learning_rate": "0.001", "mirror": "false"}
+
+
+def test_a_row_with_the_papers_preset_has_the_papers_steps(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("sizes = ['10k']\nrows = [{algo = 'mc', preset = 'paper'}]")
+    assert [row.steps for row in read_plan(tmp_path / "a.toml").rows] == [2_000_000]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("rows = ['mc'", "not a readable TOML file"),
+        ("rows = ['mc']", "sizes is missing"),
+        ("rows = ['mc']\nsizes = ['few']", "expected a whole number"),
+        ("rows = ['mc']\nsizes = ['10k']\nsteps = 0", "steps = 0"),
+        ("rows = ['sarsa']\nsizes = ['10k']", "'sarsa' is unknown"),
+        ("rows = [{n = 3}]\nsizes = ['10k']", "expected a list of estimators"),
+        ("rows = ['mc', 'mc']\nsizes = ['10k']", "two rows are called 'mc'"),
+        ("rows = [{algo = 'mc', name = 'a', shift = [1, 2]}]\nsizes = ['10k']", "would name 2 rows"),
+        ("rows = [{algo = 'mc', seed = 1}]\nsizes = ['10k']", "seed: the study sets it"),
+        ("rows = ['mc']\nsizes = ['10k']\nsetting = 'off'", "setting = 'off'; expected off-policy or on-policy"),
+        ("rows = ['mc']\nsizes = ['10k']\nsplits = 'test'", "unknown key 'splits'"),
+        ("rows = ['mc']\nsizes = ['10k']\npolicies = ['best']", "'best' is unknown"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_file(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_plan(tmp_path / "a.toml")
+    assert said in caught.value.message and "a.toml" in caught.value.message and "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize("path", sorted(PLANS.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_plans_that_ship_are_read(path: Path) -> None:
+    assert read_plan(path).rows

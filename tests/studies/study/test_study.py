@@ -1,0 +1,70 @@
+"""A real study from the command: killed, gone on with, done once; what has other settings is refused."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graspq.common.files import sha256_of
+from graspq.studies.study.cli import main
+
+
+def grasp_study(*words: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(words, prog_name="grasp-study")
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.slow
+def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
+    plan: Callable[..., Any], data: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    plan(data=data)
+    words = ["run", "tiny.toml", "--out", "study", "--device", "cpu"]
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", f"from graspq.studies.study.cli import main; main({words})"]
+    )
+    while not list(Path("study/runs").glob("*/config.json")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+
+    assert grasp_study(*words, "--workers", "0") == 0
+    out = capfd.readouterr().out
+    assert out.count("2 of 2") == 3 and "success on validation" in out
+    rows = [json.loads(line) for line in Path("study/study.jsonl").read_text().splitlines()]
+    assert [(row["row"], row["seed"]) for row in rows[:3]] == [("mc", 0), ("dql-width4", 0), ("dql-width5", 0)]
+    assert {(row["status"], row["steps"], row["split"], row["recipe_frozen"]) for row in rows} == {
+        ("done", 3, "validation", False)
+    }
+    assert all(row["outcomes"].count("1") == row["successes"] and len(row["outcomes"]) == 2 for row in rows)
+    assert len({row["recipe_sha256"] for row in rows}) == 3 and len({row["data_sha256"] for row in rows}) == 1
+
+    before = {path: sha256_of(path) for path in Path("study").rglob("eval.json")}
+    assert len(before) == 7  # six runs and the random policy
+    assert grasp_study(*words, "--workers", "0") == 0
+    assert "6 of 6 trainings finished before" in capfd.readouterr().err
+    assert {path: sha256_of(path) for path in Path("study").rglob("eval.json")} == before
+
+    plan(("batch_size = 8", "batch_size = 4"), data=data)
+    assert grasp_study(*words) == 2
+    assert "batch_size = 4 now, 8 when it was trained" in capfd.readouterr().err
+
+
+def test_a_mistake_is_one_line_before_anything_is_collected_or_trained(
+    plan: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    for replaced, said in (
+        (("width = 4,", "width = 4, nu = 1,"), "no option nu"),
+        (("steps = 3", "steps = 3\nsplit = 'test'"), "grasp-study freeze"),
+    ):
+        plan(replaced)
+        assert grasp_study("run", "tiny.toml", "--out", "study") == 2
+        assert said in capfd.readouterr().err.strip().splitlines()[-1]
+        assert sorted(Path().iterdir()) == [Path("tiny.toml")]
