@@ -29,7 +29,7 @@ def training_of(
         given = {"algo": algo, "shards": tuple(shards), "out": Path(folder) / "run", "device": "cpu", **options}
         # The actor of ddpg is at work in most of a training, but for its rest at the start.
         given |= {"actor_rest": 0.0} if algo == "ddpg" else {}
-        with session(complete(given, preset), pool, *pool.split(0.05, 0)) as current:
+        with session(complete(given, preset).for_grasps(pool.episodes), pool, *pool.split(0.05, 0)) as current:
             yield current
 
 

@@ -60,8 +60,8 @@ def timed(algo: str, preset: Preset, seed: int, shards: tuple[str, ...], limit: 
         batches_of(current, pool.split(0.05, 0)[0]) as batches,
     ):
         state, whole = current.state, current.settings
-        while state.step < whole.steps and seconds < limit and not (marks and marks[-1].auc >= AUC):
-            pause, start = min(next_validation(state.step, whole.batch_size), whole.steps), time.perf_counter()
+        while state.step < whole.last_step and seconds < limit and not (marks and marks[-1].auc >= AUC):
+            pause, start = min(next_validation(state.step, whole.batch_size), whole.last_step), time.perf_counter()
             while state.step < pause and seconds + time.perf_counter() - start < limit:
                 update(current, next(batches))["loss"].item()
             seconds += time.perf_counter() - start

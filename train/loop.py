@@ -39,8 +39,9 @@ def train(
     """
     pool = open_shards(settings.shards)
     training, held_back = pool.split(settings.validation_fraction, settings.seed)
+    settings = settings.for_grasps(pool.episodes)
     with session(settings, pool, training, held_back, ranks=ranks) as current:
-        last = settings.steps if stop_at is None else min(stop_at, settings.steps)
+        last = settings.last_step if stop_at is None else min(stop_at, settings.last_step)
         train_until(last, current, training, show_progress)
     return current.run
 
@@ -57,7 +58,7 @@ def train_until(last: int, current: Session, pool: ShardPool, show_progress: boo
             with log.timed():
                 metrics = update(current, next(batches))
             log.count(metrics)
-            saves = state.step >= settings.steps or state.step % settings.save_every == 0
+            saves = state.step >= settings.last_step or state.step % settings.save_every == 0
             if saves or state.step % LOG_EVERY == 0:
                 current.write(log)
             if saves:
@@ -81,7 +82,7 @@ def update(current: Session, batch: Batch) -> Metrics:
     rate = learning_rate(settings, state.step)
     for part in state.optimizers:
         state.set_rate(part, rate)
-    random, done = seeded("train/candidates", *keys), state.step / settings.steps
+    random, done = seeded("train/candidates", *keys), state.step / settings.last_step
     # `estimator.regression`, unless the row has an update of its own.
     metrics = estimator.update(estimator, state, batch, settings.own, random, done)
     advance(state, settings.average_decay, settings.own.lag)

@@ -1,16 +1,26 @@
 """The common recipe of training: what every estimator is trained with unless told otherwise, and the paper's."""
 
 import dataclasses
-from typing import Literal
+import math
+from typing import Literal, Self
 
 from graspq.common.options import Settings, parse_count, setting
+
+# The default number of steps for that many grasps, in batches of 256; see `Recipe.for_grasps`.
+USUAL_STEPS, USUAL_GRASPS = 1_500, 10_000
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe(Settings):
     """Options that are the same for all estimators and that a preset decides; see each field's help."""
 
-    steps: int = setting(3_000, help="Gradient steps, such as 8000 or 8k.", minimum=1, parse=parse_count)
+    steps: int | None = setting(
+        None,
+        help="Gradient steps, such as 8000 or 8k; data: as the amount of data asks, 1,500 for 10,000 grasps.",
+        minimum=1,
+        parse=parse_count,
+        none="data",
+    )
     network: str = setting("default", help="Networks: default, paper, or module:network of your own.")
     batch_size: int = setting(256, help="Transitions of a gradient step.", minimum=2)
     learning_rate: float = setting(2e-3, help="Highest learning rate of AdamW.", minimum=0)
@@ -32,6 +42,25 @@ class Recipe(Settings):
     precision: Literal["auto", "float32", "bfloat16"] = setting(
         "auto", help="Arithmetic of the networks; auto: bfloat16 on hardware that has instructions for it."
     )
+
+    def for_grasps(self, count: int) -> Self:
+        """Return the recipe with the number of steps for that many grasps, unless it has one.
+
+            steps = 1,500 · (count / 10,000)^⅔ · 256 / batch size,  to the next ten
+
+        More data are worth more steps, and fewer passes. Measurements: docs/networks.md.
+        """
+        if self.steps is not None:
+            return self
+        steps = USUAL_STEPS * (count / USUAL_GRASPS) ** (2 / 3) * 256 / self.batch_size
+        return dataclasses.replace(self, steps=math.ceil(steps / 10) * 10)
+
+    @property
+    def last_step(self) -> int:
+        """The number of steps; `for_grasps` must have set it."""
+        if self.steps is None:
+            raise ValueError("steps: the data have not decided them yet; call for_grasps")
+        return self.steps
 
 
 # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).

@@ -38,7 +38,7 @@ class RunLog:
         # A log file gets a line every half minute instead of a moving bar.
         interval = 0.5 if sys.stderr.isatty() else 30.0
         self._bar = tqdm(
-            total=settings.steps,
+            total=settings.last_step,
             initial=step,
             desc=settings.algo,
             unit="step",

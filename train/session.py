@@ -56,7 +56,7 @@ class Session:
         """Judge the policy's networks on held-back transitions; the same ones and the same candidates each time."""
         settings, state = self.settings, self.state
         batches = held_back_batches(self.held_back, settings, state.networks.precision.device)
-        random, done = seeded("train/validation", settings.seed), state.step / settings.steps
+        random, done = seeded("train/validation", settings.seed), state.step / settings.last_step
         return validate(batches, self.estimator, state.acting, settings.own, random, done)
 
     def save_and_validate(self, log: RunLog) -> None:

@@ -159,12 +159,12 @@ def learning_rate(recipe: Recipe, step: int) -> float:
     warming up:  η (step + 1) / w,  w = warmup · steps
     then:        η (constant), or ½ η (1 + cos(π (step - w) / (steps - w))) (cosine)
     """
-    warm = recipe.warmup * recipe.steps
+    warm = recipe.warmup * recipe.last_step
     if step + 1 < warm:
         return recipe.learning_rate * (step + 1) / warm
     if recipe.schedule == "constant":
         return recipe.learning_rate
-    done = (step - warm) / max(recipe.steps - warm, 1)
+    done = (step - warm) / max(recipe.last_step - warm, 1)
     return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * min(max(done, 0.0), 1.0)))
 
 

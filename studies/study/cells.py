@@ -10,12 +10,13 @@ from typing import Any
 from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
 from graspq.common.named_objects import source_digest
-from graspq.common.options import given_options
+from graspq.common.options import given_options, parse_count
 from graspq.evaluate.records import identity_digest
 from graspq.studies.study.plan_file import Row, StudyPlan
 from graspq.studies.sweep.commands import CommandLine, training_options
 from graspq.studies.sweep.settings import SweepSettings
 from graspq.studies.sweep.trial import Trial
+from graspq.train.recipe import Recipe
 from graspq.train.search_settings import CemSettings
 from graspq.train.settings import FREE, complete
 
@@ -102,27 +103,27 @@ def cells_of(plan: StudyPlan, folder: Path, *, workers: int | None = None, devic
         device: where networks run.
     """
     columns = [(row, task, size) for task in plan.values["tasks"] for size in plan.sizes for row in plan.rows]
-    columns.sort(key=lambda column: -column[0].steps)
+    columns.sort(key=lambda column: -_steps(column[0], column[2]))
     found = []
     for seed in range(plan.values["seeds"]):
         for row, task, size in columns:
-            settings = _settings(plan, folder, row, plan.dataset(task, size), workers, device)
+            settings = _settings(plan, folder, row, task, size, workers, device)
             found.append(Cell(settings, row.algo, row.options, seed, row.name, task, size))
     return found
 
 
 def _settings(
-    plan: StudyPlan, folder: Path, row: Row, dataset: Path, workers: int | None, device: str
+    plan: StudyPlan, folder: Path, row: Row, task: str, size: str, workers: int | None, device: str
 ) -> SweepSettings:
     values, threads = plan.values, plan.values["threads"]
     asked = workers if workers is not None else values["workers"]
     local = values["engine"] == "local"
     return SweepSettings(
         preset="paper" if plan.on_policy else "small",
-        shards=(str(dataset),),
+        shards=(str(plan.dataset(task, size)),),
         split=plan.split,
         seeds=values["seeds"],
-        steps=row.steps,
+        steps=_steps(row, size),
         episodes=values["episodes"],
         device=device,  # type: ignore[arg-type]
         engine=values["engine"],
@@ -131,6 +132,10 @@ def _settings(
         threads=threads,
         out=folder,
     ).complete()
+
+
+def _steps(row: Row, size: str) -> int:
+    return row.steps if row.steps is not None else Recipe().for_grasps(parse_count(size)).last_step
 
 
 def by_dataset(cells: Sequence[Cell]) -> dict[tuple[str, str], list[Cell]]:

@@ -47,13 +47,13 @@ class Row:
         name: what tables call it.
         algo: the estimator.
         options: options of training, as a command line gives them; `preset` among them.
-        steps: training steps.
+        steps: training steps; None: as the amount of data asks.
     """
 
     name: str
     algo: str
     options: Options
-    steps: int
+    steps: int | None
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,8 @@ def _rows(entry: Any, values: Mapping[str, Any]) -> Iterator[Row]:
     preset = own.get("preset", values["preset"])
     estimator = estimator_named(algo)
     recipe = estimator.paper_recipe if preset == "paper" else Recipe()
-    steps = parse_count(str(own.pop("steps", values["steps"] or recipe.steps)))
+    asked = own.pop("steps", values["steps"] or recipe.steps)
+    steps = None if asked is None else parse_count(str(asked))
     taken = sorted({*own, *values["options"]} & SET_BY_SWEEP)
     if taken:
         raise UserError(f"rows: {taken[0]}: the study sets it of each training; use the plan's own keys")

@@ -51,6 +51,14 @@ def test_twenty_steps_equal_ten_steps_a_checkpoint_and_ten_steps_bit_by_bit(
     assert same_checkpoints(unbroken.checkpoint(), resumed.checkpoint())
 
 
+def test_a_run_without_steps_takes_those_of_its_data_and_goes_on_when_asked_again(settings: Make) -> None:
+    asked = settings("mc", steps=None, batch_size=256)
+    run = train(asked)
+    steps = asked.for_grasps(run.config["dataset"]["episodes"]).last_step
+    assert run.config["settings"]["steps"] == run.metrics()[-1]["step"] == steps
+    assert train(asked).metrics() == run.metrics()
+
+
 def test_a_run_stopped_between_checkpoints_ends_in_the_same_weights(settings: Make, tmp_path: Path) -> None:
     unbroken = train(settings("dql", out=tmp_path / "unbroken"))
     train(settings("dql", out=tmp_path / "broken"), stop_at=3)

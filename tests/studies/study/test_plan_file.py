@@ -18,9 +18,9 @@ def test_lists_of_options_are_multiplied_out_and_name_their_rows(tmp_path: Path)
     )
     rows = read_plan(tmp_path / "a.toml").rows
     assert [(row.name, row.algo, row.steps) for row in rows] == [
-        ("mc", "mc", 3000),
-        ("dql-learningrate0.001-mirrorfalse", "dql", 3000),
-        ("dql-learningrate0.0001-mirrorfalse", "dql", 3000),
+        ("mc", "mc", None),
+        ("dql-learningrate0.001-mirrorfalse", "dql", None),
+        ("dql-learningrate0.0001-mirrorfalse", "dql", None),
         ("long", "mc", 8000),
     ]
     assert dict(rows[1].options) == {"preset": "default", "shift": "2", "learning_rate": "0.001", "mirror": "false"}
