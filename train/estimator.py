@@ -35,6 +35,11 @@ class EstimatorSettings(Settings):
         return None
 
     @property
+    def unused_parts(self) -> frozenset[str]:
+        """Names of the estimator's networks that these settings have no use for."""
+        return frozenset()
+
+    @property
     def counts_episodes(self) -> bool:
         """Whether `--batch-size` counts whole episodes, not transitions; read where a batch holds episodes."""
         return False
@@ -200,6 +205,10 @@ class Estimator(Generic[S]):
     kept: Callable[[ShardPool, S], dict[str, Tensor]] = lambda pool, settings: {}
     update: Callable[["Estimator[S]", TrainState, Batch, S, torch.Generator, float], Metrics] = regression
     objective: Callable[["Estimator[S]", Batch, Networks, S, torch.Generator, float], Tensor] = regression_objective
+
+    def parts_of(self, settings: S) -> Parts:
+        """Return the networks of a run with these settings."""
+        return {name: maker for name, maker in self.parts.items() if name not in settings.unused_parts}
 
 
 def targets_of(

@@ -142,7 +142,9 @@ def session(
         settings=settings.network_own.to_json(),
     )
     lagged = settings.own.lag is not None
-    state = new_state(specification, estimator.parts, settings, settings.seed, precision, lagged=lagged, ranks=ranks)
+    state = new_state(
+        specification, estimator.parts_of(settings.own), settings, settings.seed, precision, lagged=lagged, ranks=ranks
+    )
     config = _configuration(settings, pool, training, held_back, specification, precision.name) | {**(described or {})}
     with contextlib.ExitStack() as stack:
 

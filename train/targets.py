@@ -125,6 +125,60 @@ def n_step(
     return _real(to_the_end + discount**steps * after, mask)
 
 
+def lambda_return(
+    reward: Tensor, value: Tensor, trace_decay: float, discount: float, mask: Tensor | None = None
+) -> Tensor:
+    """Return the mean of the n-step targets with weights (1 - λ) λ^{n-1}, and what is left of them on the return.
+
+        y_t = r_t + γ [(1 - λ) V(s_{t+1}) + λ y_{t+1}],  y_T = r_T
+
+    With λ = 0 this is the bootstrapped target, with λ = 1 the observed return.
+
+    Args:
+        reward: float [B, T], whole episodes.
+        value: V(s_t), float [B, T]; that of the first step is not read (it may be NaN).
+        trace_decay: λ in [0, 1].
+        discount: γ in [0, 1].
+        mask: bool [B, T], false where an episode has already ended; nothing is read there and the result is 0.
+
+    Returns:
+        float [B, T].
+
+    Source: Sutton and Barto 2018, equation 12.2; none in Quillen et al. 2018.
+    """
+    _check_shapes(reward, value, mask)
+    kept, worth = _real(reward, mask), _real(value, mask)
+    real = torch.ones_like(reward, dtype=torch.bool) if mask is None else mask
+    result = torch.zeros_like(kept)
+    following = torch.zeros_like(kept[:, 0])
+    for t in reversed(range(kept.shape[1])):
+        result[:, t] = kept[:, t] + discount * following
+        mixed = (1 - trace_decay) * worth[:, t] + trace_decay * result[:, t]
+        following = torch.where(real[:, t], mixed, torch.zeros_like(mixed))
+    return _real(result, mask)
+
+
+def floored(observed_return: Tensor, target: Tensor) -> Tensor:
+    """Return targets, but nowhere less than the return that was observed.
+
+        max(R_t, y_t)
+
+    In a process without chance a return is never above Q*, and the floor can only mend what bootstrapping has not yet
+    carried back. Where outcomes are chance, its mean is too high: E max ≥ max E.
+
+    Args:
+        observed_return: R_t with the targets' discount, float [B, T].
+        target: y_t, float [B, T].
+
+    Returns:
+        float [B, T].
+
+    Source: Wilcox et al. 2022, "Monte Carlo Augmented Actor-Critic"; none in Quillen et al. 2018.
+    """
+    _check_shapes(observed_return, target)
+    return torch.maximum(observed_return, target)
+
+
 def corrected_episode_value(
     reward: Tensor, advantage: Tensor, nu: float, discount: float, mask: Tensor | None = None
 ) -> Tensor:

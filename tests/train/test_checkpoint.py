@@ -24,7 +24,9 @@ Make = Callable[..., TrainSettings]
 
 def fresh_state(specification: NetworkSpecification, settings: TrainSettings) -> TrainState:
     lagged = settings.own.lag is not None
-    return new_state(specification, settings.estimator.parts, settings, settings.seed, FLOAT32, lagged=lagged)
+    return new_state(
+        specification, settings.estimator.parts_of(settings.own), settings, settings.seed, FLOAT32, lagged=lagged
+    )
 
 
 @pytest.fixture

@@ -117,7 +117,7 @@ def test_a_users_own_row_is_found_in_the_working_folder(tmp_path: Path, monkeypa
 
 
 def test_discounts_are_the_rows_own_the_datasets_or_those_given() -> None:
-    for name in ("dql", "corr-mc", "ddpg", "pcl", "blend"):
+    for name in set(ESTIMATORS) - {"supervised", "mc"}:
         assert ESTIMATORS[name].settings().chosen_discount(1.0) == 0.9
     assert dql.DqlSettings(discount=0.0).chosen_discount(1.0) == 0.0
     assert [mc.McSettings().chosen_discount(stored) for stored in (1.0, 0.95)] == [1.0, 0.95]
@@ -149,7 +149,20 @@ PASSES = {
     "ddpg": ["actor by batch", "lagged-actor by running", "lagged-q by running", "q by batch", "q by running"],
     # The first pass of its actor only notes the batch's statistics in the running ones.
     "pcl": ["actor by batch", "actor by running", "lagged-actor by running", "v by batch"],
+    "nstep": PICKED_AND_JUDGED,
+    "td-lambda": PICKED_AND_JUDGED,
+    "mc-floor": PICKED_AND_JUDGED,
     "blend": PICKED_AND_JUDGED,
+    "iql": ["lagged-q by running", "q by batch", "v by batch", "v by running"],
+    "td3-bc": [
+        "actor by batch",
+        "lagged-actor by running",
+        "lagged-q by running",
+        "lagged-twin by running",
+        "q by batch",
+        "q by running",
+        "twin by batch",
+    ],
 }
 
 
@@ -172,7 +185,7 @@ def test_target_search_and_evaluation_passes_never_use_batch_statistics(
     settings: Callable[..., TrainSettings], algo: str
 ) -> None:
     # Without averaged networks the trained ones are judged too.
-    own = {"actor_rest": 0.0, "actor_every": 1} if algo == "ddpg" else {}
+    own = {"ddpg": {"actor_rest": 0.0, "actor_every": 1}, "td3-bc": {"actor_every": 1}}.get(algo, {})
     chosen = settings(algo, steps=2, average_decay=0.0, batch_size=8, **own)
     pool = open_shards(chosen.shards)
     training, held_back = pool.split(chosen.validation_fraction, chosen.seed)

@@ -63,7 +63,7 @@ def test_the_help_says_what_either_preset_gives(capsys: pytest.CaptureFixture[st
         (["--anneal", "0.5"], "--anneal belongs to --algo corr-mc; it is no option of --algo mc"),
         (["--no-centred"], "--no-centred belongs to --algo corr-mc, --algo blend; it is no option of --algo mc"),
         (["--width", "8"], "--width belongs to --network paper; it is no option of --algo mc with --network default"),
-        (["--alpha", "1"], "No such option: --alpha (with --algo mc and --network default)"),
+        (["--beta", "1"], "No such option: --beta (with --algo mc and --network default)"),
     ],
 )
 def test_an_option_of_another_is_refused_in_one_line_that_names_whose_it_is(

@@ -12,6 +12,8 @@ from graspq.train.targets import (
     discounted_return,
     double_q,
     episode_value,
+    floored,
+    lambda_return,
     n_step,
 )
 
@@ -119,6 +121,30 @@ def test_n_step_is_bootstrapped_at_one_and_the_episode_value_from_the_horizon_on
         assert torch.equal(n_step(reward, value, discount, steps, mask), returns)
 
 
+@given(paths(), discounts, st.floats(0, 1))
+def test_the_lambda_return_is_the_fading_mean_of_the_n_step_targets_and_reads_nothing_else(
+    path: dict[str, torch.Tensor], discount: float, trace_decay: float
+) -> None:
+    reward, mask = path["reward"].where(path["mask"], torch.nan), path["mask"]
+    value = torch.cat([torch.full_like(reward[:, :1], torch.nan), path["value"][:, 1:]], dim=1).where(mask, torch.nan)
+    longest = reward.shape[1]
+    mean = trace_decay ** (longest - 1) * discounted_return(reward, discount, mask)
+    for n in range(1, longest):
+        mean = mean + (1 - trace_decay) * trace_decay ** (n - 1) * n_step(reward, value, discount, n, mask)
+    # The weights of n-step targets that reach beyond an episode's end all fall on its return.
+    result = lambda_return(reward, value, trace_decay, discount, mask)
+    torch.testing.assert_close(result, mean, rtol=0, atol=1e-12)
+    once = bootstrapped(reward, path["last"], next_values(value), discount)
+    torch.testing.assert_close(lambda_return(reward, value, 0.0, discount, mask)[mask], once[mask], rtol=0, atol=1e-12)
+
+
+def test_a_floor_raises_targets_to_the_return_and_lowers_none() -> None:
+    returns, target = torch.tensor([[0.5, 0.0, 1.0]]), torch.tensor([[0.3, 0.2, 1.0]])
+    assert torch.equal(floored(returns, target), torch.tensor([[0.5, 0.2, 1.0]]))
+    with pytest.raises(ValueError, match="one shape"):
+        floored(returns, target[:, :2])
+
+
 @given(paths(), discounts)
 def test_blended_without_advantages_is_td_lambda_from_bootstrapped_at_zero_to_the_episode_value_at_one(
     path: dict[str, torch.Tensor], discount: float
@@ -175,6 +201,7 @@ def test_all_targets_are_the_reward_at_discount_zero() -> None:
     assert torch.equal(corrected_episode_value(REWARD, -values, 1.0, 0.0), REWARD)
     assert torch.equal(episode_value(discounted_return(REWARD, 0.0)), REWARD)
     assert torch.equal(n_step(REWARD, values, 0.0, 2), REWARD)
+    assert torch.equal(lambda_return(REWARD, values, 0.5, 0.0), REWARD)
     assert torch.equal(blended(REWARD, values, -values, values / 7, 0.0), REWARD)
 
 

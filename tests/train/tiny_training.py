@@ -97,7 +97,9 @@ def fit(row: Estimator[Any], data: Data, settings: TrainSettings) -> TrainState:
     action = grasping((0.06, 0.06, 0.06, 0.4))
     specification = NetworkSpecification("tiny", (SIZE, SIZE, 3), action, STEPS, row.loss(settings.own).link)
     precision, lag = Precision("float32", torch.device("cpu")), settings.own.lag
-    state = new_state(specification, row.parts, settings, settings.seed, precision, lagged=lag is not None)
+    state = new_state(
+        specification, row.parts_of(settings.own), settings, settings.seed, precision, lagged=lag is not None
+    )
     state.networks.kept.update(row.kept(data, settings.own))  # type: ignore[arg-type]
     while state.step < settings.steps:
         generator = seeded("tests/tiny", settings.seed, state.step)

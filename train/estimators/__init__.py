@@ -10,7 +10,20 @@ from typing import Any
 from graspq.common.named_objects import named_row
 from graspq.common.text import markdown
 from graspq.train.estimator import Estimator
-from graspq.train.estimators import blend, corr_mc, ddpg, dql, mc, pcl, supervised
+from graspq.train.estimators import (
+    blend,
+    corr_mc,
+    ddpg,
+    dql,
+    iql,
+    mc,
+    mc_floor,
+    nstep,
+    pcl,
+    supervised,
+    td3_bc,
+    td_lambda,
+)
 
 ESTIMATORS: dict[str, Estimator[Any]] = {
     "supervised": supervised.row,
@@ -19,7 +32,12 @@ ESTIMATORS: dict[str, Estimator[Any]] = {
     "corr-mc": corr_mc.row,
     "ddpg": ddpg.row,
     "pcl": pcl.row,
+    "nstep": nstep.row,
+    "td-lambda": td_lambda.row,
+    "mc-floor": mc_floor.row,
     "blend": blend.row,
+    "iql": iql.row,
+    "td3-bc": td3_bc.row,
 }
 
 
