@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
 import numpy as np
 
 from graspq.common.errors import UserError
@@ -32,7 +33,7 @@ from graspq.evaluate.records import (
     write_summary,
 )
 from graspq.evaluate.rollout import Rollouts, run_rollouts
-from graspq.evaluate.scenes import Scenes, datasets_of, find_object_set, object_set_of
+from graspq.evaluate.scenes import Scenes, datasets_of, find_object_set, object_set_of, refuse_trained_objects
 from graspq.evaluate.settings import EvalSettings
 from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
@@ -103,6 +104,13 @@ def prepare(job: Job, settings: EvalSettings, beside: Sequence[Prepared] = ()) -
     task, objects = _task_and_objects(job, run, beside)
     if run is not None:
         _check_fit(job, run, task)
+        config = run.origin.config
+        if not refuse_trained_objects(objects, job.split, object_set_of(config), datasets_of(config)):
+            click.echo(
+                f"{objects.folder}: another object set than that of {job.run}, whose data are not here: whether it was "
+                "trained on these objects cannot be told",
+                err=True,
+            )
     task.draw(objects, job.split, np.random.default_rng(0))  # refuses a split that is not there
     identity = {
         "simulator": versions("pybullet", "pybullet-arm64", "numpy"),

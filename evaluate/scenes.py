@@ -79,6 +79,40 @@ def find_object_set(
     return _verified(own.folder)
 
 
+def refuse_trained_objects(objects: ObjectSet, split: str, wanted: str | None, datasets: Iterable[Path]) -> bool:
+    """Refuse to score a run as on unseen objects on some that it was trained on; `train` is never called unseen.
+
+    Args:
+        objects: that it is scored on.
+        split: split that they are drawn from.
+        wanted: SHA-256 of the set that the run's data were made with, if known.
+        datasets: folders of the datasets that the run was trained on.
+
+    Returns:
+        Whether it is sure: the set is the run's own, whose splits are disjoint, or the run's own is there to compare.
+
+    Raises:
+        UserError: a mesh of the split is one of the run's training objects.
+    """
+    if split == "train" or objects.digest() == wanted:
+        return True
+    folders = [folder / "objects" for folder in datasets if (folder / "objects" / SET_FILE).is_file()]
+    for trained in map(ObjectSet.load, folders):
+        names = {trained[name].sha256[trained[name].mesh]: name for name in _of_split(trained, "train")}
+        for tested in _of_split(objects, split):
+            there = names.get(objects[tested].sha256[objects[tested].mesh])
+            if there is not None:
+                raise UserError(
+                    f"{objects.folder}: {tested} of its split {split} is {there} of {trained.folder}, which the run "
+                    "was trained on; name a set without it, or --split train"
+                )
+    return bool(folders)
+
+
+def _of_split(objects: ObjectSet, split: str) -> tuple[str, ...]:
+    return objects.ids(split) if split in objects.splits else ()
+
+
 def _verified(folder: Path) -> ObjectSet:
     objects = ObjectSet.load(folder)
     objects.verify()

@@ -32,7 +32,9 @@ class EvalSettings(CemOptions, EngineSettings):
     episodes: int = setting(1000, help="Episodes (grasps) of each job, such as 200 or 1k.", parse=parse_count)
     seed: int = setting(0, help="Seed of the scenes: the same seed gives every policy the same scenes.", minimum=0)
     objects: Path | None = setting(
-        None, help="Folder of the object set. Default: the one the run's data were made with, else the task's own."
+        None,
+        help="Folder of the object set. Default: the one the run's data were made with, else the task's own. Where it "
+        "is another (by its digest), a split with a mesh that the run was trained on is refused.",
     )
     checkpoint: int | None = setting(None, help="Training step of the checkpoint. Default: the last.", minimum=0)
     cem_synthetic_step: StepMode = setting(

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from graspq.common.options import Group, Settings, options_from, setting, with_version
 from graspq.objects.object_set import ObjectSet
-from graspq.objects.procedural import COUNTS, SEED, make_procedural
+from graspq.objects.procedural import COUNTS, LIMITS, SEED, make_procedural
 from graspq.objects.shapes import FAMILIES
 from graspq.objects.show import contact_sheet
 from graspq.objects.targeted import make_targeted
@@ -35,6 +35,12 @@ class ProceduralSettings(Settings):
         help="Family that train and validation have no part of; test is of such families alone. May be repeated. One "
         f"of {', '.join(FAMILIES)}.",
     )
+    graspable: float = setting(
+        LIMITS.graspable,
+        help="Least probability that an object rests so that the jaw can take it from above; 0 filters none out.",
+        minimum=0,
+        maximum=1,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +62,11 @@ class ImportSettings(Settings):
         None, help="Density in kg/m³, above 0; without it a URDF's mass counts, else 450 kg/m³."
     )
     name: str | None = setting(None, help="Name of the set; without it the name of SOURCE.")
+    split: str | None = setting(
+        None,
+        help="Split of all objects, such as test for a set that nothing is trained on; without it a tenth is test and "
+        "the others train, each by its id alone.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +105,7 @@ def procedural(settings: ProceduralSettings) -> None:
         test=settings.test,
         validation=settings.validation,
         held_out=settings.held_out_family,
+        graspable=settings.graspable,
     )
     _report(made, there)
 
@@ -120,6 +132,7 @@ def import_(settings: ImportSettings) -> None:
         scale=settings.scale,
         density=settings.density,
         name=settings.name,
+        split=settings.split,
         left_out=lambda line: tqdm.write(line, file=sys.stderr),
     )
     _report(made, there)

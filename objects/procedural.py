@@ -58,6 +58,7 @@ def make_procedural(
     test: int = COUNTS["test"],
     validation: int = COUNTS["validation"],
     held_out: Sequence[str] = (),
+    graspable: float = LIMITS.graspable,
 ) -> ObjectSet:
     """Make the procedural set and return it.
 
@@ -68,6 +69,7 @@ def make_procedural(
         test: objects of the split "test", never seen in training.
         validation: objects of the split "validation", which choices are made on; may be 0.
         held_out: families that have no part in "train" and "validation"; "test" is then of these alone.
+        graspable: least probability, 0 to 1, that an object rests so that the jaw can take it.
 
     Raises:
         UserError: the counts are not positive, the seed is negative, a family is unknown or none is left, or the folder
@@ -83,20 +85,21 @@ def make_procedural(
     if unknown or set(held_out) == set(FAMILIES):
         raise UserError(f"--held-out-family {' '.join(unknown or held_out)}: choose some of {', '.join(FAMILIES)}")
     counts = {"train": train, "test": test, "validation": validation}
+    filtered = [] if graspable == LIMITS.graspable else [f"graspable{graspable:g}"]
     return write_object_set(
         Path(folder),
-        _models(seed, counts, tuple(name for name in FAMILIES if name in held_out)),
-        name="-".join(["procedural", *(["without", *sorted(set(held_out))] if held_out else [])]),
+        _models(seed, counts, tuple(name for name in FAMILIES if name in held_out), graspable),
+        name="-".join(["procedural", *(["without", *sorted(set(held_out))] if held_out else []), *filtered]),
         generator_version=GENERATOR_VERSION,
         seed=seed,
         total=sum(counts.values()),
     )
 
 
-def _models(seed: int, counts: dict[str, int], held_out: tuple[str, ...]) -> Iterator[ObjectModel]:
+def _models(seed: int, counts: dict[str, int], held_out: tuple[str, ...], graspable: float) -> Iterator[ObjectModel]:
     for split, count in counts.items():
         for index in range(count):
-            yield procedural_object(seed, split, index, held_out)
+            yield procedural_object(seed, split, index, held_out, graspable)
 
 
 def families_of(split: str, held_out: Sequence[str]) -> tuple[str, ...]:
@@ -112,12 +115,17 @@ def main_family(seed: int, split: str, index: int, families: Sequence[str] = tup
     return families[int(order[place])]
 
 
-def procedural_object(seed: int, split: str, index: int, held_out: Sequence[str] = ()) -> ObjectModel:
+def procedural_object(
+    seed: int, split: str, index: int, held_out: Sequence[str] = (), graspable: float = LIMITS.graspable
+) -> ObjectModel:
     """Return one object, a pure function of its arguments; `split` is "train", "test" or "validation"."""
     rng = generator("objects/procedural", seed, list(COUNTS).index(split), index)
     extras = [name for name in SIMPLE if split == "test" or name not in held_out]
     family = main_family(seed, split, index, families_of(split, held_out))
-    return draw_object(rng, family, extras, object_id=f"{split}_{index:03d}", split=split, color=draw_color(rng))
+    color = draw_color(rng)
+    return draw_object(
+        rng, family, extras, object_id=f"{split}_{index:03d}", split=split, color=color, graspable=graspable
+    )
 
 
 def draw_object(
@@ -128,8 +136,9 @@ def draw_object(
     object_id: str,
     split: str,
     color: Color,
+    graspable: float = LIMITS.graspable,
 ) -> ObjectModel:
-    """Draw objects of a main family in several sizes until one keeps `LIMITS`, and return it.
+    """Draw objects of a main family in several sizes until one keeps `LIMITS`, and `graspable`, and return it.
 
     The logarithms of size and mass are even, that of the mass within what size and density leave.
     """
@@ -150,7 +159,7 @@ def draw_object(
             model = solid.model(
                 object_id=object_id, split=split, families=shape.families, color=color, mass=mass, scale=scale
             )
-            if graspable_share(model.parts) >= LIMITS.graspable:
+            if graspable_share(model.parts) >= graspable:
                 return model
     raise RuntimeError(f"no {family} within the limits in {_MOST_DRAWS} draws")
 

@@ -8,7 +8,7 @@ import hashlib
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ def import_meshes(
     scale: float = 1.0,
     density: float | None = None,
     name: str | None = None,
+    split: str | None = None,
     left_out: Callable[[str], None] = warnings.warn,
 ) -> ObjectSet:
     """Make an object set of all usable meshes under `source` and return it.
@@ -49,6 +50,7 @@ def import_meshes(
         scale: metres per unit of the files (a URDF's own mesh scale comes first), > 0.
         density: kg/m³; None takes the mass a URDF states, and 450 kg/m³ where none does.
         name: of the set; None takes the name of `source`.
+        split: that all objects are put in; None splits them by `split_of`.
         left_out: called with a line on each object that cannot be used; the others make the set.
 
     Raises:
@@ -63,10 +65,10 @@ def import_meshes(
     files = _object_files(source)
 
     def models() -> Iterator[ObjectModel]:
-        splits, unusable = splits_of(list(files)), list[str]()
+        unusable = list[str]()
         for object_id, path in files.items():
             try:
-                model = _model(source, object_id, path, splits[object_id], scale, density)
+                model = _model(source, object_id, path, split or split_of(object_id), scale, density)
             except UserError as error:
                 unusable.append(error.message)
             else:
@@ -105,17 +107,14 @@ def _clean(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("._-") or "object"
 
 
-def splits_of(ids: Sequence[str]) -> dict[str, str]:
-    """Return the split of each object, "train" or "test".
+def split_of(object_id: str) -> str:
+    """Return the split of an object, "train" or "test", by its id alone: an object that is added moves no other.
 
-    Where all ids are numbers, those that end in 0 are "test", as in the paper. Else a tenth is, chosen by the SHA-256
-    of each id, but at least one and never all: adding objects to two or more moves none from "train" to "test".
+    Of ids that are numbers those that end in 0 are "test", as in the paper; of others a tenth, by their SHA-256.
     """
-    if all(name.isdigit() for name in ids) and any(name.endswith("0") for name in ids) and len(ids) > 1:
-        return {name: "test" if name.endswith("0") else "train" for name in ids}
-    places = {name: int.from_bytes(hashlib.sha256(name.encode()).digest()[-6:]) / 2**48 for name in ids}
-    first, last = min(ids, key=places.__getitem__), max(ids, key=places.__getitem__)
-    return {name: "test" if (places[name] < 0.1 or name == first) and name != last else "train" for name in ids}
+    if object_id.isdigit():
+        return "test" if object_id.endswith("0") else "train"
+    return "test" if int.from_bytes(hashlib.sha256(object_id.encode()).digest()[-6:]) / 2**48 < 0.1 else "train"
 
 
 def _model(source: Path, object_id: str, path: Path, split: str, scale: float, density: float | None) -> ObjectModel:

@@ -284,6 +284,25 @@ def test_another_object_set_than_the_runs_must_be_asked_for(
     assert command("grasp-eval", moved, *SMALL, "--plan", "--objects", own.folder).code == 0
 
 
+def test_objects_that_a_run_was_trained_on_are_not_tested_under_another_name(
+    run_folder: Path, objects_folder: Path, command: Any, tmp_path: Path
+) -> None:
+    renamed = tmp_path / "renamed"
+    shutil.copytree(objects_folder, renamed)
+    text = (renamed / "object_set.json").read_text()
+    swap = {"train": "validation", "validation": "train"}
+    values = json.loads(text)
+    for one in values["objects"]:
+        one["split"] = swap.get(one["split"], one["split"])
+    (renamed / "object_set.json").write_text(json.dumps(values))
+    words = (run_folder, *SMALL, "--plan", "--objects", renamed)
+    refused = command("grasp-eval", *words)
+    assert refused.code == 2 and len(refused.lines) == 1
+    assert "of its split validation is train_000 of" in refused.lines[0]
+    assert command("grasp-eval", *words, "--split", "train").code == 0
+    assert command("grasp-eval", *words, "--split", "test").code == 0
+
+
 OWN_ROW = """
 import dataclasses
 from graspq.train.estimators import ESTIMATORS

@@ -12,6 +12,7 @@ from graspq.common.errors import UserError
 from graspq.common.seeding import generator
 from graspq.objects import procedural
 from graspq.objects.geometry import Array, convex_hull, half_spaces, union_mass_properties
+from graspq.objects.graspable import graspable_share
 from graspq.objects.object_set import ObjectSet
 from graspq.objects.procedural import COUNTS, LIMITS, main_family, make_procedural, procedural_object, thickness
 from graspq.objects.shapes import FAMILIES, cuboid, rotation
@@ -74,6 +75,13 @@ def test_held_out_families_have_no_part_in_training_and_the_test_is_of_them_alon
     assert {of_object[0] for of_object in families["train"]} == set(FAMILIES) - set(names)
     assert {of_object[0] for of_object in families["test"]} == set(names)
     assert made.name == "procedural-without-bar-cylinder"
+
+
+def test_an_unfiltered_set_has_objects_that_the_jaw_cannot_take(tmp_path: Path) -> None:
+    made = make_procedural(tmp_path / "set", seed=SEED, train=24, test=1, validation=0, graspable=0.0)
+    shares = [graspable_share(made.parts_of(name)) for name in made.ids("train")]
+    assert min(shares) < 0.5 and max(shares) > 0.85
+    assert made.name == "procedural-graspable0"
 
 
 @pytest.mark.parametrize("held_out", [["egg"], list(FAMILIES)])

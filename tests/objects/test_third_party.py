@@ -7,7 +7,7 @@ import trimesh
 
 from graspq.common.errors import UserError
 from graspq.objects.geometry import half_spaces, union_mass_properties
-from graspq.objects.third_party import import_meshes, splits_of
+from graspq.objects.third_party import import_meshes, split_of
 
 BOX = (0.03, 0.05, 0.08)
 
@@ -134,22 +134,29 @@ def test_the_origin_and_turn_of_a_urdf_shape_place_its_mesh(source: Path, tmp_pa
 
 
 def test_numbers_are_split_as_in_the_paper() -> None:
-    splits = splits_of([f"{index:03d}" for index in range(1000)])
-    held_out = [name for name, split in splits.items() if split == "test"]
+    held_out = [name for name in (f"{index:03d}" for index in range(1000)) if split_of(name) == "test"]
     assert len(held_out) == 100
     assert all(name.endswith("0") for name in held_out)
 
 
-def test_a_tenth_of_other_names_is_held_out_and_an_added_object_moves_none_into_it() -> None:
-    names = [f"cup{index}" for index in range(400)]
-    assert 20 < list(splits_of(names).values()).count("test") < 60
-    known: dict[str, str] = splits_of(names[:2])
-    for count in range(3, 60):
-        splits = splits_of(sorted(names[:count]))
-        assert {"train", "test"} == set(splits.values())
-        assert not [name for name, split in known.items() if split == "train" and splits[name] == "test"]
-        known = splits
-    assert splits_of(["cup"]) == {"cup": "train"}
+def test_a_tenth_of_other_names_is_held_out() -> None:
+    assert 20 < [split_of(f"cup{index}") for index in range(400)].count("test") < 60
+
+
+def test_an_object_that_is_added_moves_no_other(source: Path, tmp_path: Path) -> None:
+    for name in ("cup2", "170"):
+        trimesh.creation.box(BOX).export(source / f"{name}.stl")
+    before = import_meshes(source, tmp_path / "few")
+    for name in ("1", "a", "cup30", "cup4"):
+        trimesh.creation.box(BOX).export(source / f"{name}.stl")
+    after = import_meshes(source, tmp_path / "more")
+    assert {name: after[name].split for name in before.ids()} == {name: before[name].split for name in before.ids()}
+    assert before["170"].split == "test"
+
+
+def test_a_whole_set_can_be_put_in_one_split(source: Path, tmp_path: Path) -> None:
+    trimesh.creation.box(BOX).export(source / "cup.stl")
+    assert set(import_meshes(source, tmp_path / "set", split="test").splits) == {"test"}
 
 
 def test_a_mesh_of_three_metres_is_refused_and_the_advised_scale_works(source: Path, tmp_path: Path) -> None:
