@@ -240,6 +240,7 @@ def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "run": job.run.as_posix() if job.run is not None else None,
         "algo": run.origin.algo if run is not None else None,
         "checkpoint_step": run.origin.step if run is not None else None,
+        **_origin(job, run),
         "seed": job.seed,
         "object_set": {"name": prepared.objects.name, "sha256": prepared.objects.digest()},
         "cem": search,
@@ -247,6 +248,22 @@ def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "versions": versions(*PACKAGES),
         "code_revision": code_revision(),
         "job": json.loads(json.dumps(prepared.identity)),
+    }
+
+
+def _origin(job: Job, run: "RunPolicy | None") -> dict[str, Any]:
+    """Return what a run was made of: its seed, data, recipe and code."""
+    if run is None:
+        return dict.fromkeys(("training_seed", "data_sha256", "recipe_sha256", "trained_by"))
+    # Imported late: it needs PyTorch.
+    from graspq.evaluate.recipe_digest import recipe_digest
+
+    config = run.origin.config
+    return {
+        "training_seed": config["settings"].get("seed"),
+        "data_sha256": config["dataset"].get("manifest_sha256"),
+        "recipe_sha256": recipe_digest(config, job.cem),
+        "trained_by": config.get("code_revision"),
     }
 
 

@@ -13,18 +13,14 @@ from tqdm import tqdm
 
 from graspq.common.errors import UserError
 from graspq.common.files import writable_folder
-from graspq.common.text import aligned, write_csv, write_jsonl
+from graspq.common.text import aligned
 from graspq.engine.plan import Ending, carry_out
 from graspq.evaluate.evaluation import Prepared, prepare, run_prepared
 from graspq.evaluate.jobs import Job
 from graspq.evaluate.records import EpisodeRow, Evaluation
+from graspq.evaluate.results_table import scored, write_results
 from graspq.evaluate.settings import EvalSettings
 from graspq.evaluate.statistics import wilson_interval
-
-COLUMNS = (
-    "label", "policy", "run", "algo", "checkpoint_step", "task", "split", "seed", "episodes", "status", "successes",
-    "success_rate", "ci95_low", "ci95_high", "mean_steps", "object_set", "object_set_sha256", "folder", "error",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -142,8 +138,7 @@ def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None
         if table is not None:
             writable_folder(table, "results table")
             rows.append(_row(ending, evaluation))
-            write_jsonl(table / "results.jsonl", rows)
-            write_csv(table / "results.csv", COLUMNS, rows)
+            write_results(table, rows)
 
     carry_out(plan, report, again=settings.again, keep_going=len(plan) > 1)
     return not failed
@@ -166,14 +161,8 @@ def _line(ending: Ending[Planned], evaluation: Evaluation | None) -> str:
 def _row(ending: Ending[Planned], evaluation: Evaluation | None) -> dict[str, Any]:
     """Return a job's row of the table of results."""
     job = ending.unit.job
-    row: dict[str, Any] = dict.fromkeys(COLUMNS)
-    row |= {name: getattr(job, name) for name in ("label", "policy", "task", "split", "seed", "episodes")}
-    row["run"], row["error"] = job.run.as_posix() if job.run is not None else None, ending.error
-    row["status"] = "failed" if evaluation is None else "finished"
     if evaluation is not None:
-        summary = evaluation.summary
-        row |= {name: summary[name] for name in COLUMNS if name in summary and name != "object_set"}
-        row["ci95_low"], row["ci95_high"] = summary["ci95"]
-        row["object_set"], row["object_set_sha256"] = summary["object_set"]["name"], summary["object_set"]["sha256"]
-        row["folder"] = evaluation.folder.as_posix()
-    return row
+        return {"status": "finished", **scored(evaluation)}
+    named = {name: getattr(job, name) for name in ("label", "policy", "task", "split", "seed", "episodes")}
+    run = job.run.as_posix() if job.run is not None else None
+    return {"status": "failed", **named, "run": run, "error": ending.error}

@@ -9,8 +9,8 @@ from typing import Any
 
 from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
-from graspq.common.named_objects import source_digest
 from graspq.common.options import given_options, parse_count
+from graspq.evaluate.recipe_digest import deciding
 from graspq.evaluate.records import identity_digest
 from graspq.studies.study.plan_file import Row, StudyPlan
 from graspq.studies.sweep.commands import CommandLine, training_options
@@ -18,10 +18,7 @@ from graspq.studies.sweep.settings import SweepSettings
 from graspq.studies.sweep.trial import Trial
 from graspq.train.recipe import Recipe
 from graspq.train.search_settings import CemSettings
-from graspq.train.settings import FREE, complete
-
-# What tells runs of one recipe apart, and what does not decide what is learned.
-NOT_OF_A_RECIPE = FREE | {"seed"}
+from graspq.train.settings import complete
 
 
 @dataclass(frozen=True)
@@ -65,29 +62,19 @@ class Cell(Trial):
         """
         command = self.training_command()
         given = given_options(command.main.make_context(command.script, list(command.arguments)))
-        found: dict[str, Any] = {"search": CemSettings().to_json()}
         if self.settings.on_policy:
             # Imported late: it needs the simulator.
             from graspq.studies.online.resolve import resolve
 
             plan = resolve(given)
-            training = plan.train
-            found["online"] = {name: value for name, value in plan.described().items() if name != "split_seed"}
-        else:
-            training = complete({name: value for name, value in given.items() if name != "preset"}, given["preset"])
-        found["training"] = of_a_recipe(training.to_json())
-        own = [name for name in (training.algo, training.network) if ":" in name]
-        return found | ({"sources": {name: source_digest(name) for name in own}} if own else {})
+            return deciding(plan.train.to_json(), CemSettings(), plan.described())
+        training = complete({name: value for name, value in given.items() if name != "preset"}, given["preset"])
+        return deciding(training.to_json(), CemSettings())
 
     @property
     def digest(self) -> str:
         """SHA-256 of `deciding`, which stands beside the score."""
         return identity_digest(self.deciding)
-
-
-def of_a_recipe(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of a run's settings that decides what is learned, but for data and seed."""
-    return {name: value for name, value in settings.items() if name not in NOT_OF_A_RECIPE}
 
 
 def cells_of(plan: StudyPlan, folder: Path, *, workers: int | None = None, device: str = "auto") -> list[Cell]:

@@ -15,8 +15,9 @@ from graspq.common.files import locked, remove_temporaries, writable_folder
 from graspq.common.options import INTERRUPTED, parse_count
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
 from graspq.engine.plan import Ending, carry_out
+from graspq.evaluate.recipe_digest import of_a_recipe
 from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
-from graspq.studies.study.cells import Cell, by_dataset, of_a_recipe
+from graspq.studies.study.cells import Cell, by_dataset
 from graspq.studies.study.freezing import difference, require_frozen
 from graspq.studies.study.plan_file import StudyPlan
 from graspq.studies.study.scores import write_scores

@@ -15,10 +15,13 @@ import pytest
 
 from graspq.common.files import sha256_of
 from graspq.evaluate.films import read_films
+from graspq.evaluate.recipe_digest import recipe_digest
 from graspq.evaluate.records import Evaluation
+from graspq.evaluate.results_table import outcomes_of, read_results
 from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
 from graspq.sim.task import TASKS
+from graspq.train.search_settings import CemSettings
 
 SMALL = ("--episodes", "2", "--workers", "0")
 
@@ -75,6 +78,38 @@ def test_several_jobs_give_one_table_in_two_formats(workplace: SimpleNamespace) 
     assert [row["label"] for row in table] == ["mc", "random"]
     assert [float(row["success_rate"]) for row in table] == [row["success_rate"] for row in rows]
     assert rows[0]["object_set_sha256"] == rows[1]["object_set_sha256"]
+
+
+def test_a_row_names_data_recipe_and_code_and_holds_every_outcome(workplace: SimpleNamespace, run_folder: Path) -> None:
+    run, random = read_results(workplace.out / "results.jsonl")
+    config = json.loads((run_folder / "config.json").read_text())
+    assert run["data_sha256"] == config["dataset"]["manifest_sha256"]
+    assert (run["trained_by"], run["training_seed"]) == (config["code_revision"], 0)
+    assert run["recipe_sha256"] == recipe_digest(config, CemSettings())
+    assert run["scored_by"] == random["scored_by"] != ""
+    assert "pybullet" in run["simulator"]
+    for row in (run, random):
+        episodes = Evaluation.load(Path(row["folder"])).rows()
+        assert outcomes_of(row).tolist() == [one.success for one in episodes]
+    assert [random[name] for name in ("data_sha256", "recipe_sha256", "trained_by", "training_seed")] == [None] * 4
+
+
+def test_the_digest_of_a_recipe_follows_what_decides_what_is_learned_and_nothing_else(run_folder: Path) -> None:
+    config = json.loads((run_folder / "config.json").read_text())
+    digest = recipe_digest(config, CemSettings())
+
+    def changed(**settings: object) -> str:
+        return recipe_digest({**config, "settings": {**config["settings"], **settings}}, CemSettings())
+
+    for name, value in {"seed": 5, "out": "elsewhere", "shards": ["moved"], "threads": 7, "device": "cuda"}.items():
+        assert changed(**{name: value}) == digest, name
+    own = {**config["settings"]["own"], "discount": 0.123}
+    others = {changed(learning_rate=0.5), changed(steps=7), changed(own=own), changed(validation_fraction=0.5)}
+    others |= {
+        recipe_digest(config, CemSettings(samples=32)),
+        recipe_digest({**config, "online": {"a": 1}}, CemSettings()),
+    }
+    assert len(others | {digest}) == 7
 
 
 def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -> None:
