@@ -122,6 +122,7 @@ def test_the_mean_over_runs_is_the_two_way_analysis_of_variance_worked_by_hand()
     assert result.freedom == pytest.approx(freedom, rel=1e-12)
     narrow = mean_success(SMALL, confidence=0.5)
     half = float(stats.t.ppf(0.75, freedom)) * math.sqrt(variance)
+    assert mean_success(~SMALL).low == 0.0, "nor below 0"
     assert (narrow.low, narrow.high) == pytest.approx((mean - half, mean + half), rel=1e-12)
     assert result.low < narrow.low and result.high == 1.0, "no rate is above 1"
 

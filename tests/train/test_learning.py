@@ -151,3 +151,4 @@ def test_the_whole_loop_with_the_default_network_learns_from_shards_and_cem_acts
     assert bool((choice.action[:, 0] > 0).all())
     measures = [row["validation"] for row in run.metrics() if "validation" in row][-1]
     assert measures["calibration_error"] < 0.15 and measures["roc_auc_last_step"] > 0.8
+    assert 0.15 < measures["soft_opc"] < 0.35 and 0.2 < measures["opc"] < 0.42, (measures["opc"], measures["soft_opc"])
