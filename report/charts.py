@@ -27,6 +27,7 @@ class Series:
         points: (x, y) in data units.
         quiet: drawn thin and pale, such as the training loss beside the held-back one.
         dots: sizes (radii) of dots at the points; empty for none.
+        band: (x, low, high), drawn pale behind the curve; empty for none.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Series:
     points: Points
     quiet: bool = False
     dots: Sequence[float] = ()
+    band: Sequence[tuple[float, float, float]] = ()
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class DrawnSeries:
     quiet: bool
     path: str
     dots: list[tuple[float, float, float]]
+    band: str
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,9 @@ def line_chart(
         placed = [place(x, y) for x, y in points]
         path = "M" + " L".join(f"{x} {y}" for x, y in placed)
         dots = [(x, y, radius) for (x, y), radius in zip(placed, one.dots, strict=False)]
-        drawn.append(DrawnSeries(one.name, one.color, one.quiet, path, dots))
+        edge = [place(x, low) for x, low, _ in one.band] + [place(x, high) for x, _, high in reversed(one.band)]
+        band = "M" + " L".join(f"{x} {y}" for x, y in edge) + " Z" if edge else ""
+        drawn.append(DrawnSeries(one.name, one.color, one.quiet, path, dots, band))
     return LineChart(
         title,
         description,

@@ -10,13 +10,17 @@ from PIL import Image
 from graspq.common.text import counted
 from graspq.evaluate.films import Film, read_films
 from graspq.report.findings import Findings
+from graspq.report.rows import rows_of
 
 
 def film_groups(findings: Findings) -> list[dict[str, Any]]:
     """Return the film strips, grouped by policy; those of candidates stand open."""
     groups = []
     for (task, split, *_), scores in findings.panels.items():
-        for score in sorted(scores, key=lambda score: (score.is_reference, -score.rate)):
+        # Of several training seeds those of the first.
+        for score in (
+            row.scores[0] for row in sorted(rows_of(scores), key=lambda row: (row.is_reference, -row.rate.value))
+        ):
             films = read_films(score.evaluations[0])
             if films:
                 drawn = [_film(film) for film in films]

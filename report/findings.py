@@ -1,9 +1,8 @@
-"""What a report is made of: the runs and evaluations found in some folders, and the statistics that need several.
+"""What a report is made of: the runs and evaluations found in some folders, a score for each policy.
 
 Nothing here imports PyTorch or PyBullet: a report can be made on a machine that has neither.
 """
 
-import itertools
 import json
 import math
 from collections import defaultdict
@@ -17,12 +16,14 @@ import numpy as np
 
 from graspq.common.errors import UserError
 from graspq.evaluate.records import EVAL_FILE, ORACLE, RANDOM, EpisodeRow, Evaluation, find_evaluations, identity_digest
-from graspq.evaluate.statistics import PairedDifference, paired_difference, wilson_interval
+from graspq.evaluate.statistics import wilson_interval
 from graspq.report.stability import Sweep, all_left_out, find_sweeps
 from graspq.train.run import Run
 
 RUN_FILE = "config.json"
 REFERENCES = (RANDOM, ORACLE)
+Scene = tuple[int, int, tuple[str, ...]]
+"""Seed of an evaluation, index of the episode, the objects in the bin."""
 
 
 class PanelKey(NamedTuple):
@@ -73,6 +74,11 @@ class RunData:
             if isinstance(value, int | float) and math.isfinite(value):
                 points.append((float(row.get("step", 0)), float(value)))
         return points
+
+    def validation_at(self, step: int) -> dict[str, Any] | None:
+        """Return the numbers of the validation at a step, or None."""
+        found = [row["validation"] for row in self.metrics if row.get("step") == step and "validation" in row]
+        return found[-1] if found and isinstance(found[-1], dict) else None
 
     def last_validation(self) -> dict[str, Any] | None:
         """Return the last validation row's numbers, or None."""
@@ -130,7 +136,8 @@ class Score:
                 continue
         return found
 
-    def outcomes(self) -> dict[tuple[Any, ...], bool]:
+    @cached_property
+    def outcomes(self) -> dict[Scene, bool]:
         """Return success by scene; scores of a panel share task, split and object set."""
         return {(row.seed, row.episode, row.object_ids): row.success for row in self.rows}
 
@@ -246,21 +253,6 @@ def _run_name(evaluation: Evaluation, names: dict[Path, str]) -> str:
         if parent in names:
             return names[parent]
     return str(evaluation.summary["label"])
-
-
-def comparisons(scores: Sequence[Score], most: int = 12) -> list[tuple[str, str, PairedDifference]]:
-    """Return the paired differences of candidates on scenes that both met, better first; then of the best to random."""
-    candidates = sorted((score for score in scores if not score.is_reference), key=lambda score: -score.rate)
-    pairs = list(itertools.combinations(candidates, 2))[:most]
-    pairs += [(candidates[0], score) for score in scores if candidates and score.policy == RANDOM]
-    results = []
-    for first, second in pairs:
-        one, two = first.outcomes(), second.outcomes()
-        common = sorted(one.keys() & two.keys())
-        if common:
-            difference = paired_difference([one[key] for key in common], [two[key] for key in common])
-            results.append((first.name, second.name, difference))
-    return results
 
 
 def calibration_of(rows: Iterable[EpisodeRow], bins: int = 10) -> list[tuple[float, float, int]]:

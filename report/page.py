@@ -18,9 +18,11 @@ from graspq.report.curves import calibration_charts, learning_curves
 from graspq.report.film_strips import film_groups
 from graspq.report.findings import Findings, RunData, Score, gather
 from graspq.report.made_with import command_lines, settings_tables, version_rows
+from graspq.report.rows import Row, best_of, rows_of
 from graspq.report.stability import stability_of
 from graspq.report.success import evaluation_row, interval_text, panel_of, percent, set_name
 
+REFERENCE_NAMES = {RANDOM: "Random policy", ORACLE: "Scripted oracle"}
 PALETTE = 8  # colours of candidates; the two after them are the references'
 
 
@@ -84,13 +86,16 @@ def render(findings: Findings, title: str | None = None) -> str:
 
 
 def _colors(findings: Findings) -> dict[str, int]:
+    """Return the colour of each run and policy; runs of one row have the same."""
+    together = {score.name: row.scores[0].name for row in _rows(findings) for score in row.scores}
     names = [run.name for run in findings.runs]
-    names += [score.name for scores in findings.panels.values() for score in scores if not score.is_reference]
-    return {name: index % PALETTE for index, name in enumerate(dict.fromkeys(names))}
+    names += [score.name for row in _rows(findings) if not row.is_reference for score in row.scores]
+    firsts = list(dict.fromkeys(together.get(name, name) for name in names))
+    return {name: firsts.index(together.get(name, name)) % PALETTE for name in names}
 
 
-def _best(scores: Sequence[Score]) -> Score | None:
-    return max((score for score in scores if not score.is_reference), key=lambda score: score.rate, default=None)
+def _rows(findings: Findings) -> list[Row]:
+    return [row for scores in findings.panels.values() for row in rows_of(scores)]
 
 
 def _reference(scores: Sequence[Score], policy: str) -> Score | None:
@@ -98,10 +103,11 @@ def _reference(scores: Sequence[Score], policy: str) -> Score | None:
 
 
 def _headline(scores: Sequence[Score], runs: Sequence[RunData]) -> str:
-    best = _best(scores)
+    best = best_of(rows_of(scores))
     if best is not None:
-        seen = best.evaluations[0].summary["split"] == "train"
-        return f"{best.name} succeeds in {percent(best.rate)} of grasps of {'training' if seen else 'unseen'} objects"
+        seen = best.scores[0].evaluations[0].summary["split"] == "train"
+        objects = f"{'training' if seen else 'unseen'} objects"
+        return f"{best.name} succeeds in {percent(best.rate.value)} of grasps of {objects}"
     if runs:
         return f"Training of {', '.join(run.name for run in runs[:4])}" + (" and others" if len(runs) > 4 else "")
     return "Evaluation of the baselines"
@@ -129,13 +135,14 @@ def _lead(scores: Sequence[Score]) -> str:
 
 def _selection(findings: Findings, scores: Sequence[Score]) -> str:
     """Return on which split the best was selected, and from how many; empty where there was nothing to choose."""
-    best = _best(scores)
-    candidates = [score for score in scores if not score.is_reference]
-    places = {parent for score in candidates for one in score.evaluations for parent in one.folder.resolve().parents}
+    rows = rows_of(scores)
+    best, candidates = best_of(rows), [row for row in rows if not row.is_reference]
+    evaluations = (one for row in candidates for score in row.scores for one in score.evaluations)
+    places = {parent for one in evaluations for parent in one.folder.resolve().parents}
     tried = sum(len(sweep.rows) for sweep in findings.sweeps if sweep.folder.resolve() in places)
     if best is None or (len(candidates) < 2 and tried < 2):
         return ""
-    split = best.evaluations[0].summary["split"]
+    split = best.scores[0].evaluations[0].summary["split"]
     swept = f", among them the best of {counted(tried, 'job')} of a sweep" if tried else ""
     return (
         f"Best of {counted(len(candidates), 'candidate')}{swept}: selected by success on these very scenes of the "
@@ -144,15 +151,14 @@ def _selection(findings: Findings, scores: Sequence[Score]) -> str:
 
 
 def _cards(findings: Findings, scores: Sequence[Score]) -> list[dict[str, str]]:
-    best, cards = _best(scores), []
-    for name, score in (
-        (best.name if best is not None else "", best),
-        ("Random policy", _reference(scores, RANDOM)),
-        ("Scripted oracle", _reference(scores, ORACLE)),
-    ):
-        if score is not None:
-            detail = f"95 %: {interval_text(*score.interval)}"
-            cards.append({"name": name, "number": percent(score.rate), "detail": detail})
+    rows, cards = rows_of(scores), []
+    best = best_of(rows)
+    for row in [best, *(row for row in rows if row.is_reference)]:
+        if row is not None:
+            name = REFERENCE_NAMES.get(row.scores[0].policy or "", row.name)
+            detail = f"95 %: {interval_text(row.rate.low, row.rate.high)}"
+            detail += f", {counted(len(row.scores), 'training seed')}" if row.several else ""
+            cards.append({"name": name, "number": percent(row.rate.value), "detail": detail})
     episodes = sum(int(one.summary["episodes"]) for one in findings.evaluations)
     if episodes > 0:
         cards.append({"name": "Episodes scored", "number": f"{episodes:,}", "detail": "grasps in simulation"})

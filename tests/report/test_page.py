@@ -15,9 +15,18 @@ import pytest
 
 from graspq.evaluate.films import Film, write_films
 from graspq.evaluate.records import FORMAT_VERSION, EpisodeRow, Evaluation, write_rows, write_summary
-from graspq.evaluate.statistics import paired_difference, wilson_interval
-from graspq.report.findings import calibration_of, comparisons, gather
+from graspq.evaluate.statistics import (
+    Interval,
+    holm,
+    mean_success,
+    object_counts,
+    paired_difference,
+    success_difference,
+    wilson_interval,
+)
+from graspq.report.findings import calibration_of, gather
 from graspq.report.page import render, write_report
+from graspq.report.rows import comparisons, rows_of
 
 VOID = {"meta", "img", "br", "line", "rect", "circle", "path", "input", "link"}
 
@@ -59,13 +68,20 @@ def checked(page: str) -> Checker:
 
 
 def make_evaluation(
-    folder: Path, label: str, successes: np.ndarray, *, policy: str = "cem", seed: int = 0, films: int = 0
+    folder: Path,
+    label: str,
+    successes: np.ndarray,
+    *,
+    policy: str = "cem",
+    seed: int = 0,
+    films: int = 0,
+    **more: object,
 ) -> Evaluation:
     """Write an evaluation of these outcomes with the real writers."""
     folder.mkdir(parents=True)
     rows = [
-        EpisodeRow(index, seed, ("test_001",), bool(success), "test_001" if success else None, 4, "height",
-                   float(success), 0.8 if success else 0.3)
+        EpisodeRow(index, seed, (f"test_{index % 20:03d}",), bool(success), "test_001" if success else None, 4,
+                   "height", float(success), 0.8 if success else 0.3)
         for index, success in enumerate(successes)
     ]  # fmt: skip
     write_rows(folder, rows)
@@ -79,6 +95,7 @@ def make_evaluation(
         "seed": seed, "object_set": {"name": "procedural", "sha256": "ab" * 32}, "command": f"grasp-eval {label}",
         "versions": {"numpy": "2"}, "code_revision": "abc", "job": {"policy": label, "task": {}},
     }  # fmt: skip
+    summary |= more
     return write_summary(folder, summary)
 
 
@@ -131,13 +148,80 @@ def test_a_best_of_several_says_on_which_split_it_was_selected(scored: Path) -> 
     assert "selected by" not in render(gather([scored / "runs" / "mc"], scored / "baselines"))
 
 
-def test_runs_are_averaged_over_seeds_only_where_their_seeds_differ(scored: Path) -> None:
-    for seed in (0, 1):
-        path = scored / "runs" / "dql" / "config.json"
-        config = json.loads(path.read_text())
-        config["settings"] |= {"algo": "mc", "seed": seed}
-        path.write_text(json.dumps(config))
-        assert ("Means over training seeds" in render(gather([scored / "runs"], None))) == (seed == 1)
+def test_runs_are_averaged_over_seeds_only_where_recipes_agree_and_seeds_differ(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    for place, (recipe, seed) in enumerate([("a", 0), ("b", 0), ("b", 1), ("c", 0), ("c", 0)]):
+        more = {"recipe_sha256": recipe, "data_sha256": "d", "training_seed": seed}
+        make_evaluation(tmp_path / f"{place}", f"mc-{place}-seed{seed}", rng.random(50) < 0.5, **more)
+    ((_, scores),) = gather([tmp_path], None).panels.items()
+    assert sorted(len(row.scores) for row in rows_of(scores)) == [1, 1, 1, 2]
+    assert "Over training seeds" in render(gather([tmp_path], None))
+    assert "Over training seeds" not in render(gather([tmp_path / "0"], None))
+
+
+@pytest.fixture
+def several(tmp_path: Path) -> Path:
+    """Three seeds of two recipes, one run of a third, and the baselines."""
+    rng = np.random.default_rng(2)
+    hard = rng.random(100)
+    for algo, rates in (("mc", (0.5, 0.6, 0.55)), ("dql", (0.8, 0.85, 0.9)), ("pcl", (0.3,))):
+        for seed, rate in enumerate(rates):
+            more = {"recipe_sha256": algo, "data_sha256": "d", "training_seed": seed, "algo": algo}
+            success = hard + 0.1 * rng.normal(size=100) < rate
+            make_evaluation(tmp_path / f"runs/{algo}{seed}", f"{algo}-10k-seed{seed}", success, films=1, **more)
+    for name, rate in (("random", 0.2), ("oracle", 0.99)):
+        make_evaluation(tmp_path / f"baselines/{name}", name, hard < rate, policy=name)
+    return tmp_path
+
+
+def test_runs_of_one_recipe_are_one_row_with_the_interval_over_runs_scenes_and_objects(several: Path) -> None:
+    ((_, scores),) = gather([several / "runs"], several / "baselines").panels.items()
+    rows = rows_of(scores)
+    assert [row.name for row in rows] == ["random", "pcl-10k-seed0", "mc-10k", "dql-10k", "oracle"]
+    files = [several / f"runs/dql{seed}" for seed in range(3)]
+    success = np.array([[row.success for row in Evaluation.load(folder).rows()] for folder in files])
+    counts = object_counts([(f"test_{index % 20:03d}",) for index in range(100)])
+    expected = mean_success(success, counts)
+    assert (rows[3].rate.value, rows[3].rate.low) == pytest.approx((expected.value, expected.low))
+    assert rows[1].rate == Interval(rows[1].scores[0].rate, *wilson_interval(rows[1].scores[0].successes, 100))
+    page = render(gather([several / "runs"], several / "baselines"))
+    checker = checked(page)
+    assert f"dql-10k succeeds in {100 * expected.value:.1f}" in page
+    assert "3 training seeds" in page and len(re.findall('class="run"', page)) == 6
+    assert len(checker.images) == 3 * 3, "films of the first run of a row"
+    assert any(
+        label.startswith("Performance profile. Success rates of single runs: mc-10k: ") for label in checker.labels
+    )
+    assert page.count('class="band"') == 2
+    again = render(gather([several / "runs"], several / "baselines"))
+    assert again == page, "draws are the same each time"
+
+
+def test_the_best_row_is_compared_with_every_other_but_the_oracle_by_holms_correction(several: Path) -> None:
+    ((_, scores),) = gather([several / "runs"], several / "baselines").panels.items()
+    rows = {row.name: row for row in rows_of(scores)}
+    found = comparisons(list(rows.values()))
+    assert [one.other.name for one in found] == ["mc-10k", "pcl-10k-seed0", "random"]
+    counts = object_counts([scene[2] for scene in rows["dql-10k"].scenes])
+    for one in found:
+        expected = success_difference(rows["dql-10k"].success, one.other.success, counts)
+        assert (one.difference, one.p_value, one.scenes) == (expected, expected.p_value, 100)
+    assert [one.adjusted for one in found] == holm([one.p_value for one in found])
+    assert any(one.adjusted > one.p_value for one in found)
+
+
+def test_measures_of_validation_are_correlated_with_success_where_checkpoints_are_scored(scored: Path) -> None:
+    assert "Choosing without a simulator" not in render(gather([scored / "runs"], None))
+    rng = np.random.default_rng(3)
+    for step, rate in ((2, 0.1), (4, 0.9)):
+        for algo in ("mc", "dql"):
+            folder = scored / f"runs/{algo}/evaluations/step{step}"
+            make_evaluation(
+                folder, algo, rng.random(50) < rate, checkpoint_step=step, job={"task": {}, "network": step}
+            )
+    page = render(gather([scored / "runs"], None))
+    checked(page)
+    assert "Choosing without a simulator" in page and re.search(r"held-back loss</td><td class=.num.>4</td>", page)
 
 
 def test_a_run_that_was_never_evaluated_has_a_page_too(run_folder: Path) -> None:
@@ -181,10 +265,12 @@ def test_seeds_are_pooled_and_of_one_seed_the_longest_evaluation_counts(tmp_path
 
 def test_differences_are_those_of_scenes_that_both_policies_met(scored: Path) -> None:
     findings = gather([scored / "runs"], scored / "baselines")
-    ((first, second, difference), *_) = comparisons(next(iter(findings.panels.values())))
+    (first, random) = comparisons(rows_of(next(iter(findings.panels.values()))))
     hard = np.random.default_rng(0).random(200)
-    assert (first, second) == ("mc", "dql")
-    assert difference == paired_difference(hard < 0.6, hard < 0.5)
+    assert (first.other.name, random.other.name) == ("dql", "random")
+    expected = paired_difference(hard < 0.6, hard < 0.5)
+    assert first.difference == Interval(expected.difference, expected.low, expected.high)
+    assert (first.p_value, first.adjusted) == (expected.p_value, min(1.0, expected.p_value))
 
 
 def test_calibration_of_rollouts_is_binned_by_q() -> None:
