@@ -260,7 +260,7 @@ def _estimate(
     if variance < 1e-15:
         low, high = alone
         error = (high - low) / (2 * NormalDist().inv_cdf(0.5 + confidence / 2))
-        return SeveralRuns(value, min(low, value), max(high, value), error, scenes - 1.0, scenes)
+        return SeveralRuns(value, low, high, error, scenes - 1.0, scenes)
     error = math.sqrt(variance)
     freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
     half = float(scipy.stats.t.ppf(0.5 + confidence / 2, freedom)) * error

@@ -152,8 +152,8 @@ def opc(q: Floats, success: npt.NDArray[np.bool_]) -> float | None:
         return None
     _, place = np.unique(q, return_inverse=True)
     of_all, of_successes = (np.bincount(some, minlength=place.max() + 1) for some in (place, place[success]))
-    # The part that lies above each value of Q, b = -∞ first.
-    above_all, above_successes = (1 - np.append(0, np.cumsum(some)) / some.sum() for some in (of_all, of_successes))
+    # The part that lies above each value of Q; b = -∞ would give 0, as the highest does.
+    above_all, above_successes = (1 - np.cumsum(some) / some.sum() for some in (of_all, of_successes))
     return float(np.max(above_successes - above_all))
 
 

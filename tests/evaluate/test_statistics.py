@@ -170,12 +170,16 @@ def test_where_nothing_varies_the_intervals_are_those_of_single_runs() -> None:
     certain = np.ones((3, 40), dtype=bool)
     result = mean_success(certain)
     assert (result.low, result.high) == wilson_interval(40, 40)
+    assert result.error == pytest.approx((1 - result.low) / (2 * 1.959963984540054))
     alike, apart = success_difference(certain, certain), success_difference(certain, ~certain)
     assert (alike.low, alike.high, alike.p_value) == (-alike.high, alike.high, 1.0)
     assert alike.high == pytest.approx(paired_difference(certain[0], certain[0]).high)
     assert apart.value == apart.high == 1.0
     assert apart.low == paired_difference(certain[0], ~certain[0]).low
     assert apart.p_value < 1e-6
+    # One success each, in different scenes: neither runs nor scenes differ.
+    crossed = success_difference(np.eye(2, dtype=bool), np.zeros((2, 2), dtype=bool))
+    assert crossed.low <= crossed.value == 0.5 <= crossed.high
 
 
 def test_neither_the_order_of_runs_scenes_and_objects_nor_their_names_matter() -> None:
