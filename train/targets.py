@@ -148,13 +148,11 @@ def lambda_return(
     """
     _check_shapes(reward, value, mask)
     kept, worth = _real(reward, mask), _real(value, mask)
-    real = torch.ones_like(reward, dtype=torch.bool) if mask is None else mask
     result = torch.zeros_like(kept)
     following = torch.zeros_like(kept[:, 0])
     for t in reversed(range(kept.shape[1])):
         result[:, t] = kept[:, t] + discount * following
-        mixed = (1 - trace_decay) * worth[:, t] + trace_decay * result[:, t]
-        following = torch.where(real[:, t], mixed, torch.zeros_like(mixed))
+        following = (1 - trace_decay) * worth[:, t] + trace_decay * result[:, t]
     return _real(result, mask)
 
 

@@ -32,6 +32,7 @@ KEPT = {
     "synthetic_deviation": torch.tensor([[1.0, 1.0, 0.5, 1.0], [0.2, 0.2, 0.1, 0.2]]),
     "synthetic_low": torch.tensor([[-2.0, -4.0, -5.0, -2.0], [-0.5, -0.5, -0.7, -0.5]]),
     "synthetic_high": torch.tensor([[2.0, 4.0, -3.0, 2.0], [0.5, 0.5, -0.3, 0.5]]),
+    "use_pose": torch.tensor(False),
 }
 
 
@@ -193,14 +194,18 @@ def test_supervised_searches_in_the_box_of_its_step_and_late_ones_in_the_last(ru
         assert bool((asked >= KEPT["synthetic_low"][box]).all()) and bool((asked <= KEPT["synthetic_high"][box]).all())
 
 
-def test_a_motion_of_supervised_ends_inside_the_workspace(run_of):
+def test_a_motion_of_supervised_ends_inside_the_workspace_where_it_may_use_the_pose(run_of):
     task = TASKS["regular"]
     low, high = (np.asarray(bound) for bound in task.settings.workspace_bounds)
     # From the border where BEST leads out of the workspace in y, 3 limits below the least height that it may end at.
     pose = np.array([0.55, -0.13 + 0.06, 0.015 + 3 * 0.06, 0.0], dtype=np.float32)
-    policy = acting_by(run_of("supervised"), {"q": Far()}, KEPT)
-    policy.act(observation(pose=pose), generator("test"))
-    asked = torch.cat(policy._placed.networks["q"].asked).numpy()
+    asked = []
+    for use_pose in (True, False):
+        policy = acting_by(run_of("supervised"), {"q": Far()}, KEPT | {"use_pose": torch.tensor(use_pose)})
+        policy.act(observation(pose=pose), generator("test"))
+        asked.append(torch.cat(policy._placed.networks["q"].asked).numpy())
+    asked, blind = asked
+    assert blind[:, 1].min() < -2 and blind[:, 2].min() < -4
     ends = pose + asked * np.asarray(task.action.limits)
     assert (ends >= low - 1e-6).all() and (ends <= high + 1e-6).all()
     assert asked[:, 1].min() == pytest.approx(-1) and asked[:, 2].min() == pytest.approx(-3)

@@ -36,7 +36,7 @@ CORRECTED = SQUARED | {
     "look_in_mirror": False,
 }
 OWN: dict[str, dict[str, Any]] = {
-    "supervised": SQUARED,
+    "supervised": SQUARED | {"use_pose": False},
     "dql": DOUBLE_Q | {"candidates": 16},  # P: 16 actions uniformly at random
     "mc": SQUARED | {"discount": None},  # P, footnote; C
     # C: 100,000 of 2 million steps; the advantage's Q is the trained network's, gradient and all; 32 episodes.

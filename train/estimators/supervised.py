@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from graspq.common.options import setting
 from graspq.datasets.pool import ShardPool
 from graspq.train.acting import Acting, ObservedState, StochasticSearch
 from graspq.train.batch import Batch
@@ -18,12 +19,16 @@ from graspq.train.estimators import mc
 from graspq.train.search_settings import CemSettings, StepMode
 from graspq.train.selection import SearchSpace
 
-PREFIX = "synthetic_"
+PREFIX, USE_POSE = "synthetic_", "use_pose"
 
 
 @dataclasses.dataclass(frozen=True)
 class SupervisedSettings(RegressionSettings):
     """Options of `supervised`; its target is that of `mc`, the return, which without discount is the outcome."""
+
+    use_pose: bool = setting(
+        False, help="Let the policy know the gripper's pose, and search motions that end inside the workspace alone."
+    )
 
     def chosen_discount(self, stored: float) -> float:
         """Return 1: the outcome has no discount."""
@@ -40,12 +45,12 @@ def synthetic_action(batch: Batch) -> Tensor:
 
 
 def measured_motions(pool: ShardPool, settings: SupervisedSettings) -> dict[str, Tensor]:
-    """Return mean, standard deviation (n), least and greatest synthetic action of each step in the data.
+    """Return mean, standard deviation (n), least and greatest synthetic action of each step in the data; `use_pose`.
 
     A step that no training episode reached has those of the last step that one did.
 
     Returns:
-        `synthetic_mean`, `synthetic_deviation`, `synthetic_low` and `synthetic_high`, float32 [T, A].
+        `synthetic_mean`, `synthetic_deviation`, `synthetic_low` and `synthetic_high`, float32 [T, A]; `use_pose`, bool.
     """
     rows = [pool.read_columns(ref, ("step", "synthetic_action")) for ref in pool.blocks]
     steps = torch.cat([torch.from_numpy(columns["step"].astype("int64")) for columns in rows])
@@ -55,10 +60,11 @@ def measured_motions(pool: ShardPool, settings: SupervisedSettings) -> dict[str,
         here = motions[steps == step]
         moments = [here.mean(0), here.std(0, correction=0), here.amin(0), here.amax(0)] if len(here) else measured[-1]
         measured.append(moments)
-    return {
+    tables = {
         PREFIX + name: torch.stack(values).float()
         for name, values in zip(SearchSpace._fields, zip(*measured, strict=True), strict=True)
     }
+    return tables | {USE_POSE: torch.tensor(settings.use_pose)}
 
 
 def motions_at(kept: Mapping[str, Tensor], step: Tensor) -> SearchSpace:
@@ -109,14 +115,14 @@ class SearchOfMotions(StochasticSearch):
     """The cross-entropy method over whole motions to the last pose, as the network learned them; one step is taken.
 
     Differs: 2. The released code searches single steps, which are not what its network learned from at any but the last
-    step. 3. The search starts from the motions of that step in the data and stays in their range. 4. Where the pose of
-    the gripper is known the range is cut to end poses inside the workspace; no network sees the pose.
+    step. 3. The search starts from the motions of that step in the data and stays in their range; with `--use-pose` it
+    is cut to end poses inside the workspace. No network sees the pose.
     """
 
     def space(self, acting: Acting, state: ObservedState, near: Tensor) -> SearchSpace:
-        """Return the motions of the data at this step that end inside the workspace."""
+        """Return the motions of the data at this step; with `use_pose` those that end inside the workspace."""
         space = SearchSpace(*(bound.to(near) for bound in motions_at(acting.kept, state.step)))
-        if state.pose is None or acting.pose_bounds is None:
+        if state.pose is None or acting.pose_bounds is None or not bool(acting.kept[USE_POSE]):
             return space
         low, high = acting.pose_bounds
         limits = torch.tensor(acting.action.limits, device=near.device)

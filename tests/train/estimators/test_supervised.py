@@ -34,6 +34,8 @@ def motions_of(pool: ShardPool, step: int) -> np.ndarray:
 def test_the_motions_of_each_step_are_measured_and_steps_never_seen_take_the_last_seen_ones(dataset: Path) -> None:
     pool = open_shards([dataset])
     extra = measured_motions(pool, SupervisedSettings())
+    assert not bool(extra.pop("use_pose")), "the pose is an option"
+    assert bool(measured_motions(pool, SupervisedSettings(use_pose=True))["use_pose"])
     assert {name: list(tensor.shape) for name, tensor in extra.items()} == {
         f"synthetic_{name}": [15, 4] for name in SearchSpace._fields
     }
