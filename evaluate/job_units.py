@@ -17,6 +17,7 @@ from graspq.common.text import aligned
 from graspq.engine.plan import Ending, carry_out
 from graspq.evaluate.evaluation import Prepared, prepare, run_prepared
 from graspq.evaluate.jobs import Job
+from graspq.evaluate.over_seeds import lines_over_seeds, over_seeds
 from graspq.evaluate.records import EpisodeRow, Evaluation
 from graspq.evaluate.results_table import scored, write_results
 from graspq.evaluate.settings import EvalSettings
@@ -127,7 +128,7 @@ def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None
     Raises:
         UserError: the only job fails, or the table cannot be written.
     """
-    failed, rows = False, list[dict[str, Any]]()
+    failed, rows, finished = False, list[dict[str, Any]](), list[Evaluation]()
 
     def report(ending: Ending[Planned]) -> None:
         nonlocal failed
@@ -135,12 +136,16 @@ def run_plan(plan: Sequence[Planned], settings: EvalSettings, table: Path | None
         # Read once: reading checks the digests of all its files.
         evaluation = ending.unit.evaluation if ending.error is None else None
         click.echo(_line(ending, evaluation), err=ending.error is not None)
+        finished.extend([evaluation] if evaluation is not None else [])
         if table is not None:
             writable_folder(table, "results table")
             rows.append(_row(ending, evaluation))
             write_results(table, rows)
 
     carry_out(plan, report, again=settings.again, keep_going=len(plan) > 1)
+    means = lines_over_seeds(over_seeds(finished))
+    if means:
+        click.echo(means)
     return not failed
 
 

@@ -3,7 +3,6 @@
 Rates, intervals and differences are those of `evaluate/statistics.py`.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graspq.common.seeding import generator
+from graspq.evaluate.over_seeds import name_of_runs
 from graspq.evaluate.records import ORACLE
 from graspq.evaluate.statistics import (
     Interval,
@@ -100,7 +100,7 @@ def rows_of(scores: Sequence[Score]) -> list[Row]:
         scenes = _shared([score.outcomes.keys() for score in ordered])
         seeds = [score.evaluations[0].summary.get("training_seed") for score in ordered]
         if len(ordered) > 1 and len(set(seeds)) == len(seeds) and len(scenes) >= FEWEST_SCENES:
-            rows.append(Row(_name([score.name for score in ordered]), tuple(ordered), tuple(sorted(scenes))))
+            rows.append(Row(name_of_runs([score.name for score in ordered]), tuple(ordered), tuple(sorted(scenes))))
         else:
             rows += [Row(score.name, (score,), tuple(sorted(score.outcomes))) for score in ordered]
     ends = {"random": 0, ORACLE: 2}
@@ -117,12 +117,6 @@ def _recipe(score: Score) -> tuple[object, ...] | None:
     if summary.get("recipe_sha256") is None or summary.get("data_sha256") is None:
         return None
     return summary["recipe_sha256"], summary["data_sha256"], summary.get("checkpoint_step")
-
-
-def _name(names: Sequence[str]) -> str:
-    """Return the names of runs without their seeds where that is one name, else the first and how many follow."""
-    short = {re.sub(r"[-_.]?seed\d+$", "", name) for name in names}
-    return short.pop() if len(short) == 1 and short != {""} else f"{names[0]} and {len(names) - 1} more"
 
 
 def _shared(keys: Sequence[object]) -> set[Scene]:

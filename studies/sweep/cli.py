@@ -91,6 +91,7 @@ def _run(
     settings: SweepSettings, folder: Path, shared: dict[str, Any], asked: Sequence["Trial"], plan: Sequence["Trial"]
 ) -> int:
     """Do what is asked of a plan; see `sweep`."""
+    from graspq.evaluate.over_seeds import lines_over_seeds, over_seeds
     from graspq.studies.sweep.checks import check_commands, check_data
     from graspq.studies.sweep.table import as_markdown, line_of, write_tables
     from graspq.studies.sweep.workers import hand_out
@@ -125,5 +126,8 @@ def _run(
             click.echo(f"interrupted; the same command goes on with {folder}", err=True)
             return INTERRUPTED
     click.echo(as_markdown(list(states.values())), nl=False)
+    means = lines_over_seeds(over_seeds([one.evaluation for one in states.values() if one.evaluation is not None]))
+    if means:
+        click.echo(f"\n{means}")
     click.echo(f"table: {folder / 'sweep.csv'}; figure: grasp-report {folder} --out {folder / 'report.html'}", err=True)
     return int(any(states[trial.name].status != "done" for trial in asked))

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -110,6 +111,19 @@ def test_the_digest_of_a_recipe_follows_what_decides_what_is_learned_and_nothing
         recipe_digest({**config, "online": {"a": 1}}, CemSettings()),
     }
     assert len(others | {digest}) == 7
+
+
+def test_runs_of_several_training_seeds_are_summed_up_in_one_line(
+    run_folder: Path, command: Any, tmp_path: Path
+) -> None:
+    for seed in (0, 1):
+        shutil.copytree(run_folder, tmp_path / f"mc-seed{seed}")
+        config = json.loads((run_folder / "config.json").read_text())
+        config["settings"]["seed"] = seed
+        (tmp_path / f"mc-seed{seed}" / "config.json").write_text(json.dumps(config))
+    done = command("grasp-eval", f"{tmp_path}/mc-seed*", *SMALL, "--films", "0", "--out", tmp_path / "scores")
+    assert done.code == 0, done.err
+    assert re.search(r"^mc  regular validation  2 training seeds  [\d.]+ %  95 %: [\d.]+ to [\d.]+$", done.out, re.MULTILINE)
 
 
 def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -> None:

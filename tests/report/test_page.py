@@ -150,11 +150,12 @@ def test_a_best_of_several_says_on_which_split_it_was_selected(scored: Path) -> 
 
 def test_runs_are_averaged_over_seeds_only_where_recipes_agree_and_seeds_differ(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
-    for place, (recipe, seed) in enumerate([("a", 0), ("b", 0), ("b", 1), ("c", 0), ("c", 0)]):
+    for place, (recipe, seed) in enumerate([("a", 0), ("b", 0), ("b", 1), ("c", 0), ("c", 0), ("e", 0), ("e", 1)]):
         more = {"recipe_sha256": recipe, "data_sha256": "d", "training_seed": seed}
+        more |= {"checkpoint_step": place if recipe == "e" else 3}
         make_evaluation(tmp_path / f"{place}", f"mc-{place}-seed{seed}", rng.random(50) < 0.5, **more)
     ((_, scores),) = gather([tmp_path], None).panels.items()
-    assert sorted(len(row.scores) for row in rows_of(scores)) == [1, 1, 1, 2]
+    assert sorted(len(row.scores) for row in rows_of(scores)) == [1, 1, 1, 1, 1, 2]
     assert "Over training seeds" in render(gather([tmp_path], None))
     assert "Over training seeds" not in render(gather([tmp_path / "0"], None))
 
