@@ -10,7 +10,8 @@ from graspq.common.text import aligned
 from graspq.evaluate.records import Evaluation, identity_digest
 from graspq.evaluate.statistics import SeveralRuns, mean_success, object_counts
 
-# What agrees between evaluations of one line; `job` holds task settings, object set and scenes.
+FEWEST_SCENES = 2
+# What agrees between evaluations of one line, besides simulator, task settings and object set.
 SAME = ("recipe_sha256", "data_sha256", "checkpoint_step", "task", "split", "seed", "episodes")
 
 
@@ -42,14 +43,15 @@ def name_of_runs(names: Sequence[str]) -> str:
 def over_seeds(evaluations: Sequence[Evaluation]) -> list[OverSeeds]:
     """Return a line for each recipe of which several training seeds were scored, in the order of the first of each.
 
-    Evaluations of the same run and checkpoint, or that do not name their recipe, are on no line.
+    Evaluations of the same run and checkpoint, of a single scene, or that do not name their recipe are on no line.
 
     Raises:
         UserError: the rows of an evaluation's episodes are missing.
     """
     groups: dict[tuple[object, ...], list[Evaluation]] = {}
     for one in evaluations:
-        if one.summary.get("recipe_sha256") is not None and one.summary.get("training_seed") is not None:
+        named = all(one.summary.get(name) is not None for name in ("recipe_sha256", "training_seed"))
+        if named and one.summary["episodes"] >= FEWEST_SCENES:
             scenes = {name: one.summary["job"].get(name) for name in ("simulator", "task", "object_set")}
             key = (*(one.summary.get(name) for name in SAME), identity_digest(scenes))
             groups.setdefault(key, []).append(one)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graspq.common.seeding import generator
-from graspq.evaluate.over_seeds import name_of_runs
+from graspq.evaluate.over_seeds import FEWEST_SCENES, name_of_runs
 from graspq.evaluate.records import ORACLE
 from graspq.evaluate.statistics import (
     Interval,
@@ -26,8 +26,6 @@ from graspq.evaluate.statistics import (
     success_difference,
 )
 from graspq.report.findings import Scene, Score
-
-FEWEST_SCENES = 2
 
 
 @dataclass(frozen=True)

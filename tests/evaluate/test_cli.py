@@ -123,7 +123,8 @@ def test_runs_of_several_training_seeds_are_summed_up_in_one_line(
         (tmp_path / f"mc-seed{seed}" / "config.json").write_text(json.dumps(config))
     done = command("grasp-eval", f"{tmp_path}/mc-seed*", *SMALL, "--films", "0", "--out", tmp_path / "scores")
     assert done.code == 0, done.err
-    assert re.search(r"^mc  regular validation  2 training seeds  [\d.]+ %  95 %: [\d.]+ to [\d.]+$", done.out, re.MULTILINE)
+    summed_up = r"^mc  regular validation  2 training seeds  [\d.]+ %  95 %: [\d.]+ to [\d.]+$"
+    assert re.search(summed_up, done.out, re.MULTILINE)
 
 
 def test_policies_of_one_seed_meet_the_same_scenes(workplace: SimpleNamespace) -> None:

@@ -50,7 +50,8 @@ def test_what_differs_in_more_than_the_training_seed_is_no_line(tmp_path: Path, 
     success = np.arange(10) % 3 == 0
     first = evaluation(tmp_path / "mc-seed0", success)
     second = evaluation(tmp_path / "mc-seed1", success, **({"training_seed": 1} | changed))
-    assert over_seeds([first, second]) == [] and lines_over_seeds([]) == ""
+    alone = [evaluation(tmp_path / f"one{seed}", success[:1], training_seed=seed) for seed in (0, 1)]
+    assert over_seeds([first, second]) == over_seeds(alone) == [] and lines_over_seeds([]) == ""
 
 
 def test_runs_are_called_what_their_names_have_in_common() -> None:
