@@ -1,7 +1,6 @@
 """The common recipe of training: what every estimator is trained with unless told otherwise, and the paper's."""
 
 import dataclasses
-import math
 from typing import Literal, Self
 
 from graspq.common.options import Settings, parse_count, setting
@@ -53,7 +52,7 @@ class Recipe(Settings):
         if self.steps is not None:
             return self
         steps = USUAL_STEPS * (count / USUAL_GRASPS) ** (2 / 3) * 256 / self.batch_size
-        return dataclasses.replace(self, steps=math.ceil(steps / 10) * 10)
+        return dataclasses.replace(self, steps=max(round(steps / 10), 1) * 10)
 
     @property
     def last_step(self) -> int:
