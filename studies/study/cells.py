@@ -122,7 +122,10 @@ def _settings(
 
 
 def _steps(row: Row, size: str) -> int:
-    return row.steps if row.steps is not None else Recipe().for_grasps(parse_count(size)).last_step
+    if row.steps is not None:
+        return row.steps
+    batch_size = int(dict(row.options).get("batch_size", Recipe.batch_size))
+    return Recipe(batch_size=batch_size).for_grasps(parse_count(size)).last_step
 
 
 def by_dataset(cells: Sequence[Cell]) -> dict[tuple[str, str], list[Cell]]:

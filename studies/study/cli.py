@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from graspq.common.options import Group, Settings, options_from, setting, with_version
+from graspq.common.options import INTERRUPTED, Group, Settings, options_from, setting, with_version
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,18 @@ class PlanSettings(Settings):
 
 
 @dataclass(frozen=True)
-class RunSettings(PlanSettings):
+class PublishSettings(PlanSettings):
+    """Options of `grasp-study report`."""
+
+    beside: tuple[Path, ...] = setting(
+        (), help="Scores of other studies, such as results/study-paper.jsonl, to judge claims by too. May be repeated."
+    )
+    results: Path = setting(Path("results"), help="Folder for scores and figures.")
+    page: Path = setting(Path("RESULTS.md"), help="Page that gets a section on the study.")
+
+
+@dataclass(frozen=True)
+class RunSettings(PublishSettings):
     """Options of `grasp-study run`."""
 
     workers: int | None = setting(
@@ -67,7 +78,6 @@ def run(settings: RunSettings) -> int:
     Killed and started again, it goes on where it was; what is done is not done again. A training that fails is noted
     and stops none of the others. Seeds are done one after the other, so that a study that is stopped has whole columns.
     """
-    from graspq.studies.study.scores import row_of, table
     from graspq.studies.study.study import run_study
 
     plan, cells = _plan(settings, settings.workers, settings.device)
@@ -75,7 +85,8 @@ def run(settings: RunSettings) -> int:
         click.echo(plan_text(settings.folder, cells))
         return 0
     status = run_study(plan, settings.folder, cells, retry_failed=settings.retry_failed)
-    click.echo(table(plan, [row_of(plan, cell, False) for cell in cells]), nl=False)
+    if status != INTERRUPTED and any(cell.state().status == "done" for cell in cells):
+        _publish(settings)
     return status
 
 
@@ -95,6 +106,28 @@ def freeze(settings: PlanSettings) -> None:
     for name, row in recipe["rows"].items():
         click.echo(f"{row['digest'][:12]}  {name}")
     click.echo(f"{path}: {len(recipe['rows'])} rows, digest {recipe['digest'][:12]}")
+
+
+@main.command("report")
+@options_from(PublishSettings)
+def report(settings: PublishSettings) -> None:
+    """Publish the scores so far: tables and a verdict on each claim of the paper in RESULTS.md, figures, all outcomes.
+
+    `grasp-study run` does this at its end. Where the runs are not here, the scores in results/ are judged again.
+    """
+    _publish(settings)
+
+
+def _publish(settings: PublishSettings) -> None:
+    from graspq.studies.study.publishing import publish
+    from graspq.studies.study.scores import read_scores, write_scores
+
+    plan, cells = _plan(settings)
+    kept = settings.results / f"study-{plan.name}.jsonl"
+    here = settings.folder.is_dir()
+    table = write_scores(plan, settings.folder, cells) if here else read_scores([kept])
+    written = publish(plan.name, plan.path, table, read_scores(settings.beside), settings.results, settings.page)
+    click.echo(f"wrote {', '.join(path.as_posix() for path in written)}")
 
 
 def _plan(settings: PlanSettings, workers: int | None = None, device: str = "auto") -> "tuple[StudyPlan, list[Cell]]":

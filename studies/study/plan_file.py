@@ -122,7 +122,7 @@ def read_plan(path: Path) -> StudyPlan:
         kinds, _, expected = KEYS.get(key, ((), None, ""))
         if not kinds:
             raise UserError(f"{path}: unknown key {key!r}; expected some of {', '.join(KEYS)}")
-        if type(value) not in kinds or value in ([], 0):
+        if type(value) not in kinds or (value in ([], 0) and key != "policies"):
             raise UserError(f"{path}: {key} = {value!r}; expected {expected}")
     values = {key: content.get(key, usual) for key, (_, usual, _) in KEYS.items()}
     for key, allowed in CHOICES.items():

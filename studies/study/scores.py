@@ -1,32 +1,40 @@
-"""The scores of a study, a row for each cell, as JSON lines: all that statistics and claims are reckoned from.
+"""The scores of a study as JSON lines: what every run, reference and scene gave, all that its tables are reckoned from.
 
-The file is made anew from the cells' own files each time, never added to.
+The file is made anew from the evaluations' own files each time, never added to.
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from graspq.common.text import markdown, write_jsonl
-from graspq.evaluate.records import Evaluation
-from graspq.evaluate.statistics import mean_over_seeds, wilson_interval
+from graspq.common.errors import UserError
+from graspq.common.text import write_jsonl
+from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
 from graspq.studies.study.cells import Cell
 from graspq.studies.study.freezing import key_of, read_recipe
 from graspq.studies.study.plan_file import StudyPlan
-from graspq.studies.sweep.trial import run_in
+from graspq.studies.sweep.trial import SCENES_SEED, run_in
 
 SCORES_FILE = "study.jsonl"
+KINDS = ("scenes", "reference", "run")
 
 
 def write_scores(plan: StudyPlan, folder: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Write the rows of all cells; return them."""
+    """Write the scores of a study; return them.
+
+    A line is of a `kind`: `run`, see `run_row`; `reference`, a policy without a run; `scenes`, the objects that lay in
+    each scene, in the order of the outcomes.
+    """
     frozen = read_recipe(plan.recipe)["rows"] if plan.recipe.exists() else {}
-    rows = [row_of(plan, cell, frozen.get(key_of(cell), {}).get("digest") == cell.digest) for cell in cells]
+    runs = [run_row(plan, cell, frozen.get(key_of(cell), {}).get("digest") == cell.digest) for cell in cells]
+    references = list(_references(plan, folder))
+    rows = [*_scenes(plan, folder, cells), *references, *runs]
     write_jsonl(folder / SCORES_FILE, rows)
     return rows
 
 
-def row_of(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
+def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
     """Return what is known of a cell.
 
     Args:
@@ -36,21 +44,22 @@ def row_of(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
     """
     state, run = cell.state(), run_in(cell.run_folder)
     row: dict[str, Any] = {
-        "study": plan.name, "row": cell.row, "algo": cell.algo, "options": dict(cell.options), "task": cell.task,
-        "size": cell.size, "setting": plan.values["setting"], "seed": cell.seed, "split": plan.split,
+        "kind": "run", "study": plan.name, "row": cell.row, "algo": cell.algo, "options": dict(cell.options),
+        "task": cell.task, "size": cell.size, "setting": plan.values["setting"], "seed": cell.seed, "split": plan.split,
         "recipe_sha256": cell.digest, "recipe_frozen": frozen, "status": state.status, "steps": state.steps,
         "training_seconds": state.training_seconds, "reason": state.reason,
     }  # fmt: skip
     if run is not None:
+        row["discount"] = run.config.get("discount")
         row["data_sha256"] = run.config.get("dataset", {}).get("manifest_sha256")
         row["trained_by"] = run.config.get("code_revision")
         validations = [one["validation"] for one in run.metrics() if "validation" in one]
         row["validation"] = validations[-1] if validations else None
-    return row | (scored(state.evaluation) if state.evaluation is not None else {})
+    return row | (_score(state.evaluation) if state.evaluation is not None else {})
 
 
-def scored(evaluation: Evaluation) -> dict[str, Any]:
-    """Return what a table says of an evaluation; `outcomes` has a digit for each scene in order, 1 for a success."""
+def _score(evaluation: Evaluation) -> dict[str, Any]:
+    """Return what a line says of an evaluation; `outcomes` has a digit for each scene in order, 1 for a success."""
     summary = evaluation.summary
     named = ("episodes", "successes", "success_rate", "ci95", "mean_steps")
     return {name: summary[name] for name in named} | {
@@ -60,34 +69,51 @@ def scored(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def table(plan: StudyPlan, rows: Sequence[dict[str, Any]]) -> str:
-    """Return the table by row, size and task in Markdown: means over seeds, in the plan's order."""
-    lines = []
-    for (row, task, size), some in grouped(rows).items():
-        done = [one for one in some if one["status"] == "done"]
-        rates = [one["success_rate"] for one in done]
-        lines.append([f"`{row}`", task, size, *_success(rates, done), f"{len(done)} of {len(some)}", _status(some)])
-    return markdown(["row", "task", "size", f"success on {plan.split}", "95 % interval", "seeds", ""], lines)
+def _references(plan: StudyPlan, folder: Path) -> Iterator[dict[str, Any]]:
+    for task in plan.values["tasks"]:
+        for policy in plan.values["policies"]:
+            found = reference(plan, folder, policy, task)
+            if found is not None:
+                own = {"kind": "reference", "policy": policy, "task": task, "split": plan.split}
+                yield own | _score(found)
 
 
-def grouped(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
-    """Return rows of all seeds by row, task and size."""
-    found: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-    for one in rows:
-        found.setdefault((one["row"], one["task"], one["size"]), []).append(one)
+def _scenes(plan: StudyPlan, folder: Path, cells: Sequence[Cell]) -> Iterator[dict[str, Any]]:
+    for task in plan.values["tasks"]:
+        known = (reference(plan, folder, policy, task) for policy in plan.values["policies"])
+        found = next((one for one in known if one is not None), None)
+        if found is None:
+            scored = (cell.state().evaluation for cell in cells if cell.task == task)
+            found = next((one for one in scored if one is not None), None)
+        if found is not None:
+            ids = [list(row.object_ids) for row in found.rows()]
+            yield {"kind": "scenes", "task": task, "split": plan.split, "seed": SCENES_SEED, "object_ids": ids}
+
+
+def reference(plan: StudyPlan, folder: Path, policy: str, task: str) -> Evaluation | None:
+    """Return the score of a policy without a run on the scenes of a task, if it is there."""
+    asked = {"label": policy, "task": task, "seed": SCENES_SEED}
+    asked |= {"split": plan.split, "episodes": plan.values["episodes"]}
+    for found in find_evaluations(folder / "references"):
+        if all(found.summary.get(name) == value for name, value in asked.items()) and found.has(EPISODES_FILE):
+            return found
+    return None
+
+
+def read_scores(paths: Iterable[Path]) -> list[dict[str, Any]]:
+    """Return the lines of files that `write_scores` wrote.
+
+    Raises:
+        UserError: one of them is missing or is no such file.
+    """
+    found: list[dict[str, Any]] = []
+    for path in paths:
+        try:
+            lines = [json.loads(line) for line in path.read_text().splitlines()]
+            whole = bool(lines) and all(line["kind"] in KINDS for line in lines)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path}: not the scores of a study ({error}); run grasp-study run PLAN") from None
+        if not whole:
+            raise UserError(f"{path}: not the scores of a study; run grasp-study run PLAN")
+        found += lines
     return found
-
-
-def _success(rates: Sequence[float], done: Sequence[dict[str, Any]]) -> list[str]:
-    if not rates:
-        return ["", ""]
-    mean = mean_over_seeds(rates)
-    low, high = mean.low, mean.high
-    if low is None or high is None:
-        low, high = wilson_interval(done[0]["successes"], done[0]["episodes"])
-    return [f"{mean.mean:.3f}", f"{max(low, 0.0):.3f} to {min(high, 1.0):.3f}"]
-
-
-def _status(some: Sequence[dict[str, Any]]) -> str:
-    reasons = [f"seed {one['seed']} failed: {one['reason']}" for one in some if one["status"] == "failed"]
-    return "; ".join(reasons)

@@ -16,11 +16,10 @@ from graspq.common.options import INTERRUPTED, parse_count
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
 from graspq.engine.plan import Ending, carry_out
 from graspq.evaluate.recipe_digest import of_a_recipe
-from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
 from graspq.studies.study.cells import Cell, by_dataset
 from graspq.studies.study.freezing import difference, require_frozen
 from graspq.studies.study.plan_file import StudyPlan
-from graspq.studies.study.scores import write_scores
+from graspq.studies.study.scores import reference, write_scores
 from graspq.studies.sweep.checks import check_commands, check_data, objects_beside
 from graspq.studies.sweep.commands import CommandLine
 from graspq.studies.sweep.table import line_of
@@ -148,16 +147,6 @@ def references(plan: StudyPlan, cells: Sequence[Cell]) -> Iterator[Called]:
 
 def _is_scored(plan: StudyPlan, folder: Path, policy: str, task: str) -> bool:
     return reference(plan, folder, policy, task) is not None
-
-
-def reference(plan: StudyPlan, folder: Path, policy: str, task: str) -> Evaluation | None:
-    """Return the score of a policy without a run on the scenes of a task, if it is there."""
-    asked = {"label": policy, "task": task, "seed": SCENES_SEED}
-    asked |= {"split": plan.split, "episodes": plan.values["episodes"]}
-    for found in find_evaluations(folder / "references"):
-        if all(found.summary.get(name) == value for name, value in asked.items()) and found.has(EPISODES_FILE):
-            return found
-    return None
 
 
 def check_runs(cells: Sequence[Cell]) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from graspq.common.errors import UserError
+from graspq.studies.study.cells import cells_of
 from graspq.studies.study.plan_file import read_plan
 
 PLANS = Path(__file__).resolve().parents[3] / "studies" / "plans"
@@ -56,5 +57,7 @@ def test_a_mistake_is_one_line_that_names_the_file(text: str, said: str, tmp_pat
 
 
 @pytest.mark.parametrize("path", sorted(PLANS.glob("*.toml")), ids=lambda path: path.stem)
-def test_the_plans_that_ship_are_read(path: Path) -> None:
-    assert read_plan(path).rows
+def test_the_plans_that_ship_have_rows_whose_options_there_are(path: Path) -> None:
+    plan = read_plan(path)
+    cells = [cell for cell in cells_of(plan, Path("study"), workers=1) if cell.seed == 0]
+    assert len({cell.digest for cell in cells}) == len(plan.rows) * len(plan.sizes)

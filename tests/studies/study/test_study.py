@@ -36,9 +36,10 @@ def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
     process.wait()
 
     assert grasp_study(*words, "--workers", "0") == 0
-    out = capfd.readouterr().out
-    assert out.count("2 of 2") == 3 and "success on validation" in out
-    rows = [json.loads(line) for line in Path("study/study.jsonl").read_text().splitlines()]
+    table = [json.loads(line) for line in Path("study/study.jsonl").read_text().splitlines()]
+    assert [row["kind"] for row in table] == ["scenes", "reference", *["run"] * 6]
+    assert len(table[0]["object_ids"]) == 2 and table[1]["policy"] == "random"
+    rows = table[2:]
     assert [(row["row"], row["seed"]) for row in rows[:3]] == [("mc", 0), ("dql-width4", 0), ("dql-width5", 0)]
     assert {(row["status"], row["steps"], row["split"], row["recipe_frozen"]) for row in rows} == {
         ("done", 3, "validation", False)
@@ -46,10 +47,17 @@ def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
     assert all(row["outcomes"].count("1") == row["successes"] and len(row["outcomes"]) == 2 for row in rows)
     assert len({row["recipe_sha256"] for row in rows}) == 3 and len({row["data_sha256"] for row in rows}) == 1
 
+    page = Path("RESULTS.md").read_text()
+    assert "6 of 6 trainings" in page and all(f"| `{row['recipe_sha256'][:8]}` |" in page for row in rows)
+    assert Path("results/study-tiny.jsonl").read_bytes() == Path("study/study.jsonl").read_bytes()
+
     before = {path: sha256_of(path) for path in Path("study").rglob("eval.json")}
     assert len(before) == 7  # six runs and the random policy
     assert grasp_study(*words, "--workers", "0") == 0
     assert "6 of 6 trainings finished before" in capfd.readouterr().err
+    Path("RESULTS.md").unlink()
+    assert grasp_study("report", "tiny.toml", "--out", "elsewhere") == 0  # judged again without the runs
+    assert Path("RESULTS.md").read_text() == page
     assert {path: sha256_of(path) for path in Path("study").rglob("eval.json")} == before
 
     plan(("batch_size = 8", "batch_size = 4"), data=data)

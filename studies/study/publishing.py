@@ -1,0 +1,164 @@
+"""What a study shows: its section of RESULTS.md, with tables of rows, differences and claims, and its figures."""
+
+import itertools
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from graspq.common.errors import UserError
+from graspq.common.files import write_text
+from graspq.common.text import markdown, write_jsonl
+from graspq.evaluate.statistics import rank_correlation, wilson_interval
+from graspq.studies.study.claims import judged
+from graspq.studies.study.comparisons import Compared, Place, Scored, against_the_best, scored_rows, trainings
+from graspq.studies.study.figures import write_figures
+
+Table = Sequence[Mapping[str, Any]]
+
+
+def publish(study: str, plan: Path, table: Table, beside: Table, results: Path, page: Path | None) -> list[Path]:
+    """Write the scores, the figures and the section of a page; return what was written.
+
+    Args:
+        study: name of the study.
+        plan: its file, for the command that makes it again.
+        table: its scores, as `read_scores` gives them.
+        beside: scores of other studies, that claims are judged by too.
+        results: folder of scores and figures.
+        page: the page, which is made or gets the section at its end where it has none yet; None for none.
+
+    Raises:
+        UserError: no run is scored yet.
+    """
+    rows = scored_rows(table)
+    if not rows:
+        raise UserError(f"{study}: no run is scored yet; run: grasp-study run {plan}")
+    scores = results / f"study-{study}.jsonl"
+    write_jsonl(scores, table)
+    figures = write_figures(study, rows, trainings(table), references(table), results / "figures")
+    written = [scores, *figures]
+    if page is not None:
+        files = [Path(os.path.relpath(path, page.parent)) for path in (scores, *figures)]
+        text = section(study, plan, table, beside, files)
+        write_text(page, with_section(page.read_text() if page.exists() else "", study, text))
+        written.append(page)
+    return written
+
+
+def with_section(text: str, study: str, section: str) -> str:
+    """Return a page with what stands between the marks of a study replaced, or with marks and section at its end."""
+    begin, end = f"<!-- made by grasp-study, {study} -->", f"<!-- end of {study} -->"
+    made = f"{begin}\n\n{section}\n{end}"
+    before, found, rest = text.partition(begin)
+    if not found:
+        return f"{text.rstrip()}\n\n{made}\n".lstrip()
+    return before + made + rest.partition(end)[2]
+
+
+def section(study: str, plan: Path, table: Table, beside: Table, files: Sequence[Path]) -> str:
+    """Return the section of a study in Markdown: facts, the table of rows, figures, claims."""
+    rows = scored_rows(table)
+    scores, *figures = files
+    parts = [f"## Study {study}\n", facts(plan, table, scores), row_table(rows, table)]
+    parts += [f"![Success by row of study {study}]({path.as_posix()})\n" for path in figures]
+    correlations = correlation_table(table)
+    if correlations:
+        parts += ["### Choosing without a simulator\n", correlations]
+    parts += ["### The claims of the paper\n", claim_table([*table, *beside])]
+    return "\n".join(parts)
+
+
+def facts(plan: Path, table: Table, scores: Path) -> str:
+    """Return the sentences that a table cannot be read without."""
+    runs = [one for one in table if one["kind"] == "run"]
+    done = [one for one in runs if one["status"] == "done"]
+    frozen = all(one["recipe_frozen"] for one in done)
+    recipe = "of a frozen recipe" if frozen else "of a recipe that is not frozen"
+    splits = sorted({str(one["split"]) for one in done})
+    code = sorted({str(one.get("trained_by"))[:8] for one in done} | {str(one.get("scored_by"))[:8] for one in done})
+    data = sorted({str(one.get("data_sha256"))[:12] for one in done})
+    objects = sorted({str(one["object_set_sha256"])[:12] for one in done})
+    chosen = "" if all(one.startswith("test") for one in splits) else " Choices were made on these scores."
+    return (
+        f"`grasp-study run {plan.as_posix()}`: {len(done)} of {len(runs)} trainings, {recipe}, scored on "
+        f"`{'`, `'.join(splits)}`.{chosen} Intervals are 95 %, over new training seeds, scenes and objects; every "
+        f"policy met the same scenes. Data {', '.join(data)}, objects {', '.join(objects)}, code {', '.join(code)}; "
+        f"outcome of every grasp: [{scores.as_posix()}]({scores.as_posix()}).\n"
+    )
+
+
+def references(table: Table) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the scores of policies without a run by task."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for one in table:
+        if one["kind"] == "reference":
+            found.setdefault(one["task"], []).append(one)
+    return found
+
+
+def row_table(rows: Mapping[Place, Mapping[str, Scored]], table: Table) -> str:
+    """Return the table by task, size and row, best first, with each row's difference to the best."""
+    lines = []
+    beside, told = references(table), set[str]()
+    for place, here in rows.items():
+        compared = against_the_best(here)
+        for row in sorted(here.values(), key=lambda one: -one.mean.value):
+            lines.append(_row(place, row, compared.get(row.name)))
+        for one in beside.get(place.task, []) if place.task not in told else []:
+            low, high = wilson_interval(one["successes"], one["episodes"])
+            lines.append(
+                [one["policy"], place.task, "", f"{one['success_rate']:.3f}", f"{low:.3f} to {high:.3f}", *[""] * 6]
+            )
+        told.add(place.task)
+    heads = ["row", "task", "grasps", "success", "95 % interval", "each seed", "less the best", "p (Holm)"]
+    text = markdown([*heads, "discount", "steps", "recipe"], lines)
+    missing = [
+        f"`{row.name}` ({place}): {len(row.rows)} of {row.asked} seeds" + "".join(f"; {one}" for one in row.failures)
+        for place, here in rows.items()
+        for row in here.values()
+        if len(row.rows) < row.asked
+    ]
+    unscored = sorted(
+        {one["row"] for one in table if one["kind"] == "run"} - {name for here in rows.values() for name in here}
+    )
+    missing += [f"`{name}`: not run" for name in unscored]
+    return text + ("\nNot whole: " + ". ".join(missing) + ".\n" if missing else "")
+
+
+def _row(place: Place, row: Scored, compared: Compared | None) -> list[str]:
+    mean, first = row.mean, row.rows[0]
+    difference, p = ("", "")
+    if compared is not None:
+        one = compared.difference
+        difference = f"{one.value:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
+        p = f"{compared.p_value:.3f}" if compared.p_value >= 0.001 else "< 0.001"
+    size = place.size if place.setting == "off-policy" else f"{place.size}, {place.setting}"
+    discount = first.get("discount")
+    return [
+        f"`{row.name}`", place.task, size, f"{mean.value:.3f}", f"{mean.low:.3f} to {mean.high:.3f}",
+        " ".join(f"{rate:.3f}" for rate in row.rates), difference, p,
+        f"{discount:g}" if discount is not None else "", f"{first['steps']:,}", f"`{first['recipe_sha256'][:8]}`",
+    ]  # fmt: skip
+
+
+def correlation_table(table: Table) -> str:
+    """Return how well held-back numbers rank the runs by their success; empty where there are fewer than five runs."""
+    runs = [one for one in table if one["kind"] == "run" and one["status"] == "done" and one.get("validation")]
+    names = dict.fromkeys(itertools.chain.from_iterable(one["validation"] for one in runs))
+    lines = []
+    for name in names:
+        pairs = [(one["validation"].get(name), one["success_rate"]) for one in runs]
+        known = [
+            (value, rate) for value, rate in pairs if isinstance(value, int | float) and not isinstance(value, bool)
+        ]
+        if len(known) >= 5:
+            correlation = rank_correlation(*zip(*known, strict=True))
+            lines.append([f"`{name}`", f"{correlation:+.2f}" if correlation is not None else "", str(len(known))])
+    return markdown(["last validation", "Spearman's ρ with success", "runs"], lines) if lines else ""
+
+
+def claim_table(table: Table) -> str:
+    """Return the table of the paper's claims."""
+    lines = [[one.claim, f"**{one.verdict}**", one.test, one.seen] for one in judged(table)]
+    return markdown(["claim of the paper", "verdict", "test", "what was seen"], lines)

@@ -1,0 +1,29 @@
+"""Rows against each other on the same scenes."""
+
+import pytest
+
+from graspq.studies.study.comparisons import Place, against_the_best, scored_rows
+from tests.studies.study.scored_studies import runs, study
+
+PLACE = Place("regular", "10k", "off-policy", "test")
+
+
+def test_rows_stand_at_their_place_with_their_runs_and_failures() -> None:
+    table = study(dql=0.9)
+    table += runs("dql", 0.9, seeds=1, status="failed", reason="diverged")
+    table += runs("mc", 0.5, seeds=1, status="to do")
+    table += runs("mc", 0.5, seeds=2, size="1k")
+    found = scored_rows(table)
+    assert {place.size: set(rows) for place, rows in found.items()} == {"10k": {"dql"}, "1k": {"mc"}}
+    row = found[PLACE]["dql"]
+    assert (len(row.rows), row.asked, row.failures) == (3, 4, ("seed 0: diverged",))
+    assert row.success.shape == (3, 400) and row.counts is not None and row.counts.shape == (400, 40)
+    assert row.mean.value == pytest.approx(sum(row.rates) / 3)
+
+
+def test_the_others_are_compared_with_the_best_row() -> None:
+    found = against_the_best(scored_rows(study(dql=0.9, mc=0.7, corr_mc=0.9))[PLACE])
+    assert found["mc"].worse and not found["mc"].better
+    (other,) = set(found) - {"mc"}
+    assert not found[other].worse and found["mc"].second != other
+    assert str(found["mc"]).startswith(f"mc − {found['mc'].second}: -0.1")

@@ -1,0 +1,63 @@
+"""What a study shows: one section of a page, written anew in its place, and figures."""
+
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+
+from graspq.common.errors import UserError
+from graspq.studies.study.publishing import publish, with_section
+from graspq.studies.study.scores import read_scores
+from tests.studies.study.scored_studies import runs, study
+
+PLAN = Path("plans/s.toml")
+
+
+def test_a_study_gets_a_section_of_its_own_that_takes_the_place_of_the_older_one(tmp_path: Path) -> None:
+    page, results = tmp_path / "RESULTS.md", tmp_path / "results"
+    page.write_text("# Results\n\nOurs.\n")
+    table = study(dql=0.9, mc=0.7, ddpg=0.5) + runs("pcl", 0.5, seeds=1, status="failed", reason="diverged")
+    for _ in range(2):
+        written = publish("s", PLAN, table, [], results, page)
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in written) == [
+        "RESULTS.md", "results/figures/study-s.png", "results/study-s.jsonl",
+    ]  # fmt: skip
+    text = page.read_text()
+    assert text.startswith("# Results\n\nOurs.\n") and text.count("## Study s") == 1
+    lines = text.splitlines()
+    (best,) = [line for line in lines if line.startswith("| `dql`")]
+    (other,) = [line for line in lines if line.startswith("| `mc`")]
+    assert lines.index(best) < lines.index(other) and "| < 0.001 | 0.9 | 100 | `cccccccc` |" in other
+    assert "9 of 10 trainings, of a frozen recipe, scored on `test`" in text and "`pcl`: not run" in text
+    assert text.count("| **not tested** |") >= 2 and "| `roc_auc` |" in text
+    assert "](results/study-s.jsonl)" in text and matplotlib.image.imread(results / "figures/study-s.png").size
+    assert read_scores([results / "study-s.jsonl"]) == table
+
+
+def test_scores_of_validation_are_named_as_those_that_were_chosen_on(tmp_path: Path) -> None:
+    table = [row | {"split": "validation", "recipe_frozen": False} for row in study(dql=0.9)]
+    publish("s", PLAN, table, [], tmp_path, tmp_path / "RESULTS.md")
+    text = (tmp_path / "RESULTS.md").read_text()
+    assert "not frozen, scored on `validation`. Choices were made on these scores." in text
+
+
+def test_success_over_an_option_and_sorted_settings_are_drawn_where_rows_vary(tmp_path: Path) -> None:
+    table = study(mc=0.7)
+    for n in ("1", "3", "15"):
+        table += runs(f"nstep-n{n}", 0.8, algo="nstep", options={"preset": "default", "n": n})
+    names = {path.name for path in publish("s", PLAN, table, [], tmp_path, None)}
+    assert {"study-s-over.png", "study-s-sorted.png"} <= names
+
+
+def test_a_study_without_a_score_is_refused_and_so_is_what_is_no_study(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no run is scored yet"):
+        publish("s", PLAN, runs("mc", 0.5, status="to do"), [], tmp_path, None)
+    for text in ("", "{}", "["):
+        (tmp_path / "a.jsonl").write_text(text)
+        with pytest.raises(UserError, match="not the scores of a study"):
+            read_scores([tmp_path / "a.jsonl"])
+
+
+def test_sections_of_two_studies_live_side_by_side() -> None:
+    page = with_section(with_section("A\n", "one", "1"), "two", "2")
+    assert with_section(page, "one", "3") == page.replace("\n1\n", "\n3\n")
