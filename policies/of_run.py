@@ -6,6 +6,7 @@
 import copy
 import dataclasses
 import io
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -105,9 +106,19 @@ class RunPolicy:
         return {"network": self.origin.sha256, **({"cem": self.cem.to_json()} if self.searches else {})}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel as bytes: torch would pass tensors to other processes through shared memory."""
+        """Travel as bytes: torch would pass tensors to other processes through shared memory.
+
+        Raises:
+            UserError: a class of the networks stands inside a function.
+        """
         content = io.BytesIO()
-        torch.save(self.acting, content)
+        try:
+            torch.save(self.acting, content)
+        except (AttributeError, pickle.PicklingError) as error:
+            raise UserError(
+                f"--network {self.origin.specification.name}: cannot be sent to workers ({error}); "
+                "define its classes at the top of a module, or use --workers 0"
+            ) from None
         return _rebuilt, (self.origin, content.getvalue(), self.selection, self.cem, self.device)
 
 

@@ -128,6 +128,16 @@ def test_a_policy_travels_as_bytes_and_decides_the_same_afterwards(run_of):
             assert np.array_equal(ours, theirs) and policy.q == twin.q
 
 
+def test_a_network_whose_class_stands_inside_a_function_is_refused_by_name_where_it_would_travel(run_of):
+    class Inner(torch.nn.Module):
+        pass
+
+    policy = load(run_of("mc"))
+    policy.acting.networks["q"].inner = Inner()
+    with pytest.raises(UserError, match=r"--network paper: cannot be sent to workers .*--workers 0"):
+        pickle.dumps(policy)
+
+
 def test_a_few_lines_of_python_act_as_the_run_does(run_of, tmp_path):
     script = FIVE_LINES.format(run=str(run_of("mc")))
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
