@@ -36,7 +36,8 @@ AS_THEY_ARE = ("episode_id", "block", "seed", "ended_by", "success", "lifted_obj
 class ShardPool:
     """Logged grasps, ready to be trained on; as a sequence it holds the episodes, in the order of the blocks.
 
-    They agree in task, image shape, action space and discount.
+    They agree in task and its settings, version of the simulator, object set and its split, image shape, action space
+    and discount: `open_shards` refuses to mix others.
 
     Attributes:
         blocks: ordered by seed of the dataset, then by number: the order in which they were named does not matter.
@@ -44,7 +45,7 @@ class ShardPool:
         image_shape: (H, W, C).
         action: what an action means: names, units and limits of its A parts.
         discount: γ of `mc_return`: the stored one, or that of `with_discount`.
-        object_set: `name` and `sha256` of the object set of the first dataset.
+        object_set: `name` and `sha256` of the object set.
         manifest_digest: that of the manifest where the pool is one whole dataset, else that of the shards' digests.
     """
 

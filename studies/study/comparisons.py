@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from graspq.evaluate.results_table import outcomes_of
 from graspq.evaluate.statistics import SeveralRuns, holm, mean_success, object_counts, success_difference
 
 
@@ -56,7 +57,7 @@ class Scored:
     @cached_property
     def success(self) -> np.ndarray:
         """Outcome of each run in each scene, bool [S, N]."""
-        return np.array([[digit == "1" for digit in row["outcomes"]] for row in self.rows], dtype=bool)
+        return np.array([outcomes_of(row) for row in self.rows])
 
     @cached_property
     def mean(self) -> SeveralRuns:
@@ -87,7 +88,7 @@ def scored_rows(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, Sco
         failures = tuple(f"seed {one['seed']}: {one['reason']}" for one in some if one["status"] == "failed")
         if done:
             counts = scenes.get((place.task, place.split))
-            known = counts if counts is not None and len(counts) == len(done[0]["outcomes"]) else None
+            known = counts if counts is not None and len(counts) == done[0]["episodes"] else None
             row = Scored(name, done[0]["algo"], tuple(done), len(some), failures, known)
             found.setdefault(place, {})[name] = row
     return found

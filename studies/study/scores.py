@@ -11,12 +11,17 @@ from typing import Any
 from graspq.common.errors import UserError
 from graspq.common.text import write_jsonl
 from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
+from graspq.evaluate.results_table import scored
 from graspq.studies.study.cells import Cell
 from graspq.studies.study.freezing import key_of, read_recipe
 from graspq.studies.study.plan_file import StudyPlan
 from graspq.studies.sweep.trial import SCENES_SEED, run_in
 
 SCORES_FILE = "study.jsonl"
+OF_AN_EVALUATION = (
+    "episodes", "successes", "success_rate", "ci95_low", "ci95_high", "mean_steps", "object_set_sha256", "scored_by",
+    "simulator", "outcomes",
+)  # fmt: skip
 KINDS = ("scenes", "reference", "run")
 
 
@@ -59,14 +64,9 @@ def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
 
 
 def _score(evaluation: Evaluation) -> dict[str, Any]:
-    """Return what a line says of an evaluation; `outcomes` has a digit for each scene in order, 1 for a success."""
-    summary = evaluation.summary
-    named = ("episodes", "successes", "success_rate", "ci95", "mean_steps")
-    return {name: summary[name] for name in named} | {
-        "object_set_sha256": summary["object_set"]["sha256"],
-        "scored_by": summary["code_revision"],
-        "outcomes": "".join(str(int(row.success)) for row in evaluation.rows()),
-    }
+    """Return what a line says of an evaluation, as the table of `grasp-eval` does."""
+    found = scored(evaluation)
+    return {name: found[name] for name in OF_AN_EVALUATION}
 
 
 def _references(plan: StudyPlan, folder: Path) -> Iterator[dict[str, Any]]:
@@ -83,8 +83,8 @@ def _scenes(plan: StudyPlan, folder: Path, cells: Sequence[Cell]) -> Iterator[di
         known = (reference(plan, folder, policy, task) for policy in plan.values["policies"])
         found = next((one for one in known if one is not None), None)
         if found is None:
-            scored = (cell.state().evaluation for cell in cells if cell.task == task)
-            found = next((one for one in scored if one is not None), None)
+            runs = (cell.state().evaluation for cell in cells if cell.task == task)
+            found = next((one for one in runs if one is not None), None)
         if found is not None:
             ids = [list(row.object_ids) for row in found.rows()]
             yield {"kind": "scenes", "task": task, "split": plan.split, "seed": SCENES_SEED, "object_ids": ids}

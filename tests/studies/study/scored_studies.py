@@ -3,6 +3,9 @@
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+
+from graspq.evaluate.results_table import outcomes_text
 
 SCENES = 400
 
@@ -13,17 +16,17 @@ def scenes(task: str = "regular", split: str = "test") -> dict[str, Any]:
     return {"kind": "scenes", "task": task, "split": split, "seed": 0, "object_ids": ids}
 
 
-def outcomes(rate: float, seed: int) -> str:
+def outcomes(rate: float, seed: int) -> npt.NDArray[np.bool_]:
     """A run that succeeds where the scene is easier than its rate, but for a few scenes of its own."""
     hard = np.random.default_rng(1).random(SCENES)
     own = np.random.default_rng((2, seed)).random(SCENES)
-    return "".join(str(int(one < rate) ^ int(other < 0.02)) for one, other in zip(hard, own, strict=True))
+    return (hard < rate) ^ (own < 0.02)
 
 
-def score(digits: str) -> dict[str, Any]:
+def score(success: npt.NDArray[np.bool_]) -> dict[str, Any]:
     return {
-        "outcomes": digits, "successes": digits.count("1"), "episodes": len(digits),
-        "success_rate": digits.count("1") / len(digits), "object_set_sha256": "a" * 64, "scored_by": "b" * 40,
+        "outcomes": outcomes_text(success), "successes": int(success.sum()), "episodes": len(success),
+        "success_rate": float(success.mean()), "object_set_sha256": "a" * 64, "scored_by": "b" * 40,
     }  # fmt: skip
 
 
@@ -36,9 +39,9 @@ def runs(name: str, rate: float, *, seeds: int = 3, **changed: Any) -> list[dict
     }  # fmt: skip
     found = []
     for seed in range(seeds):
-        digits = outcomes(rate, 10 * sum(map(ord, name)) + seed)
+        success = outcomes(rate, 10 * sum(map(ord, name)) + seed)
         validation = {"loss": 1 - rate, "roc_auc": rate + 0.001 * seed}
-        found.append(common | score(digits) | {"seed": seed, "validation": validation} | changed)
+        found.append(common | score(success) | {"seed": seed, "validation": validation} | changed)
     return found
 
 
