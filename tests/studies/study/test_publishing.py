@@ -38,7 +38,7 @@ def test_scores_of_validation_are_named_as_those_that_were_chosen_on(tmp_path: P
     table = [row | {"split": "validation", "recipe_frozen": False} for row in study(dql=0.9)]
     publish("s", PLAN, table, [], tmp_path, tmp_path / "RESULTS.md")
     text = (tmp_path / "RESULTS.md").read_text()
-    assert "not frozen, scored on `validation`. Choices were made on these scores." in text
+    assert "not frozen, scored on `validation`. Choices are made on such scores" in text
 
 
 def test_success_over_an_option_and_sorted_settings_are_drawn_where_rows_vary(tmp_path: Path) -> None:
