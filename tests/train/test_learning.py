@@ -139,9 +139,8 @@ def hidden() -> tiny_mdp.Data:
         ("corr-mc", {}, "corrected"),
         ("nstep", {"n": 3}, "return"),
         ("nstep", {"n": 1}, "bootstrapped"),
-        ("dql", {}, "bootstrapped"),
     ],
-    ids=["corr-mc", "3 steps", "1 step", "dql"],
+    ids=["corr-mc", "3 steps", "1 step"],
 )
 def test_what_no_picture_shows_reaches_a_corrected_return_and_one_of_enough_steps_but_no_bootstrap(
     algo: str, own: dict[str, Any], learned_from: str, preset: Preset, seed: int, hidden: tiny_mdp.Data

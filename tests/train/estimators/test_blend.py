@@ -130,6 +130,20 @@ def test_the_weight_is_high_while_q_is_wrong_and_falls_as_it_becomes_right() -> 
 
 
 @pytest.mark.usefixtures("networks")
+def test_errors_of_earlier_batches_fade() -> None:
+    data = tiny_mdp.collect(50, 0)
+    state, row, own = learned("blend", data, steps=1), ESTIMATORS["blend"], settings(algo="blend").own
+    batch = data.whole_episodes(torch.arange(50))
+    counts = [float(state.networks.kept["blend_errors"][0].sum())]
+    for _ in range(2):
+        row.update(row, state, batch, own, seeded("tests/blend/fading"), 0.5)
+        counts.append(float(state.networks.kept["blend_errors"][0].sum()))
+    later = int(batch.later_steps.sum())
+    assert counts[1] == pytest.approx(DECAY * counts[0] + later)
+    assert counts[2] == pytest.approx(DECAY * counts[1] + later)
+
+
+@pytest.mark.usefixtures("networks")
 def test_validation_leaves_what_was_measured_as_it_is() -> None:
     data = tiny_mdp.collect(50, 0)
     state = learned("blend", data, steps=3)

@@ -16,6 +16,7 @@ from graspq.train.estimators.iql import IqlSettings, expectile_loss, implicit_q_
 from graspq.train.loop import train
 from graspq.train.networks.network import Features, QNetwork, StateNetwork
 from graspq.train.search_settings import CemSettings
+from graspq.train.selection import pointed
 from graspq.train.settings import TrainSettings
 from graspq.train.state import TrainState, seeded
 
@@ -97,7 +98,7 @@ def test_v_becomes_the_expectile_of_the_lagged_q_of_logged_actions() -> None:
     assert isinstance(v, Says) and v.outputs.item() == pytest.approx(2 + 0.75, abs=0.01)
     actor, q = state.networks.online["actor"], state.networks.online["q"]
     assert isinstance(actor, Says) and isinstance(q, Product)
-    assert not bool(actor.outputs.any()) and float(q.factor) == -5.0, "no actor is trained unless it acts"
+    assert not bool(actor.outputs.any()) and q.factor.item() == -5.0, "no actor is trained unless it acts"
 
 
 def test_the_actor_clones_logged_actions_by_the_exponential_of_their_advantage() -> None:
@@ -114,6 +115,15 @@ def test_the_actor_clones_logged_actions_by_the_exponential_of_their_advantage()
     good, bad = np.exp(0.7), np.exp(-0.7)
     assert float(actor[0, 0]) == pytest.approx((0.6 * good - 0.8 * bad) / (good + bad), abs=0.01)
     assert actor[0, 1:].tolist() == pytest.approx([0, 0, 0], abs=0.01)
+
+
+def test_no_logged_action_weighs_more_than_a_hundred() -> None:
+    # Advantages -0.9, 0.3 and 0.6: exp(50 A) is 3e-20, 3e6 and 1e13; capped, the good ones count alike.
+    settings = IqlSettings(policy="actor", sharpness=50.0, expectile=0.5)
+    state = learning(2.0, settings, 600, torch.tensor([-0.9, 0.3, 0.6]))
+    actor = state.networks.online["actor"]
+    assert isinstance(actor, Says)
+    assert float(pointed(actor.outputs, ACTION)[0].detach()) == pytest.approx(0.45, abs=0.01)
 
 
 def test_a_run_has_an_actor_only_where_it_acts(settings: Callable[..., TrainSettings], tmp_path: Path) -> None:

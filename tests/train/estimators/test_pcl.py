@@ -177,6 +177,18 @@ def test_the_gradient_flows_through_the_value_at_both_ends_of_a_path_and_through
 
 
 @pytest.mark.parametrize("penalty", [None, 2.0])
+def test_a_step_divides_the_policys_gradient_by_the_penalty_and_leaves_that_of_the_value(penalty: float | None) -> None:
+    actor, lagged, value = numbers(4, 8, seed=1).float(), numbers(4, 8, seed=2).float(), numbers(4, 1, seed=3).float()
+    batch = episodes(numbers(2, 4, 4, seed=4).float(), numbers(2, 4, seed=5).float(), MASK)
+    plain, stepped = (networks_of(actor.clone(), lagged, value.clone()) for _ in range(2))
+    settings = PclSettings(penalty=penalty)
+    residual(ESTIMATORS["pcl"], *arguments(batch, plain, settings)).backward()
+    path_consistency(ESTIMATORS["pcl"], state_of(stepped), batch, settings, seeded("tests/draws"), 0.0)
+    for part, divisor in (("actor", 0.25 if penalty is None else penalty), ("v", 1.0)):
+        torch.testing.assert_close(stepped.online[part].table.grad, plain.online[part].table.grad / divisor)
+
+
+@pytest.mark.parametrize("penalty", [None, 2.0])
 def test_a_step_tunes_the_penalty_by_the_divergence_at_its_real_states_unless_it_is_given(
     penalty: float | None,
 ) -> None:
