@@ -122,7 +122,7 @@ def n_step(
         return to_the_end
     after = torch.zeros_like(to_the_end)
     after[:, :-steps] = (_real(value, mask) - to_the_end)[:, steps:]
-    return _real(to_the_end + discount**steps * after, mask)
+    return to_the_end + discount**steps * after
 
 
 def lambda_return(

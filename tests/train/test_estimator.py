@@ -4,6 +4,7 @@ import itertools
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -180,12 +181,24 @@ def watch(networks: dict[str, nn.Module]) -> list[str]:
     return passes
 
 
-@pytest.mark.parametrize("algo", ESTIMATORS)
+OWN: dict[str, dict[str, Any]] = {
+    "ddpg": {"actor_rest": 0.0, "actor_every": 1},
+    "td3-bc": {"actor_every": 1},
+    "corr-mc with its gradient": {"judge": "online-gradient", "loss": "squared"},
+    "iql with its actor": {"policy": "actor"},
+}
+PASSES |= {
+    "corr-mc with its gradient": PICKED_AND_JUDGED,
+    "iql with its actor": ["actor by batch", *PASSES["iql"]],
+}
+
+
+@pytest.mark.parametrize("name", [*ESTIMATORS, "corr-mc with its gradient", "iql with its actor"])
 def test_target_search_and_evaluation_passes_never_use_batch_statistics(
-    settings: Callable[..., TrainSettings], algo: str
+    settings: Callable[..., TrainSettings], name: str
 ) -> None:
     # Without averaged networks the trained ones are judged too.
-    own = {"ddpg": {"actor_rest": 0.0, "actor_every": 1}, "td3-bc": {"actor_every": 1}}.get(algo, {})
+    algo, own = name.split()[0], OWN.get(name, {})
     chosen = settings(algo, steps=2, average_decay=0.0, batch_size=8, **own)
     pool = open_shards(chosen.shards)
     training, held_back = pool.split(chosen.validation_fraction, chosen.seed)
@@ -194,7 +207,7 @@ def test_target_search_and_evaluation_passes_never_use_batch_statistics(
         with training_batches(training, chosen, torch.device("cpu"), 0) as batches:
             for batch in itertools.islice(batches, 2):
                 update(current, batch)
-                assert sorted(passes) == PASSES[algo]
+                assert sorted(passes) == PASSES[name]
                 passes.clear()
         assert current.validate() is not None
         assert len(passes) >= 2 and all(name.endswith("by running") for name in passes), passes

@@ -243,7 +243,7 @@ def stepped(chosen: CorrMcSettings, progress: float = 1.0) -> Tensor:
 
 def test_the_papers_step_goes_down_the_gradient_of_the_target_and_the_default_step_does_not() -> None:
     table, v = torch.tensor([0.5, 0.25, -0.5], dtype=torch.float64, requires_grad=True), (0.3, 0.6, 0.9)
-    losses, fixed = [], []
+    losses, fixed, uncorrected = [], [], []
     for length in (3, 1, 2):
         for t in range(length):
             after = range(t + 1, length)
@@ -251,7 +251,9 @@ def test_the_papers_step_goes_down_the_gradient_of_the_target_and_the_default_st
             later = sum((0.9 ** (k - t) * (table[k] - v[k]) for k in after), torch.tensor(0.0))
             losses.append(0.5 * (table[t] - (returns - later)) ** 2)
             fixed.append(0.5 * (table[t] - (returns - later.detach())) ** 2)
-    for judge, expected in (("online-gradient", losses), ("online", fixed)):
+            uncorrected.append(0.5 * (table[t] - returns) ** 2)
+    # The lagged table has one value for all actions: by itself no action is worse than another.
+    for judge, expected in (("online-gradient", losses), ("online", fixed), ("lagged", uncorrected)):
         (gradient,) = torch.autograd.grad(torch.stack(expected).mean(), table, retain_graph=True)
         chosen = settings(judge=judge, loss="squared", anneal=0.0)
         torch.testing.assert_close(stepped(chosen), -gradient.float(), rtol=0, atol=1e-5)
