@@ -79,7 +79,9 @@ def facts(plan: Path, table: Table, scores: Path) -> str:
     code = sorted({str(one.get("trained_by"))[:8] for one in done} | {str(one.get("scored_by"))[:8] for one in done})
     data = sorted({str(one.get("data_sha256"))[:12] for one in done})
     objects = sorted({str(one["object_set_sha256"])[:12] for one in done})
-    chosen = "" if all(one.startswith("test") for one in splits) else " Choices are made on such scores, which flatters what was chosen."
+    chosen = " Choices are made on such scores, which flatters what was chosen."
+    if all(one.startswith("test") for one in splits):
+        chosen = ""
     return (
         f"`grasp-study run {plan.as_posix()}`: {len(done)} of {len(runs)} trainings, {recipe}, scored on "
         f"`{'`, `'.join(splits)}`.{chosen} Intervals are 95 %, over new training seeds, scenes and objects; every "
