@@ -100,45 +100,6 @@ def paired_difference(
 
 
 @dataclass(frozen=True)
-class MeanOverSeeds:
-    """The mean of a number over independent seeds.
-
-    Attributes:
-        mean: arithmetic mean.
-        low: lower end of Student's interval; None with fewer than two seeds.
-        high: upper end; None with fewer than two seeds.
-        deviation: sample standard deviation (n - 1); None with fewer than two seeds.
-        seeds: number of seeds.
-    """
-
-    mean: float
-    low: float | None
-    high: float | None
-    deviation: float | None
-    seeds: int
-
-
-def mean_over_seeds(values: Sequence[float], confidence: float = CONFIDENCE) -> MeanOverSeeds:
-    """Return the mean over seeds with Student's interval: m ± t(n-1) s/√n.
-
-    Args:
-        values: one number for each seed, such as success rates; at least one.
-        confidence: coverage, between 0 and 1.
-
-    Raises:
-        ValueError: `values` is empty.
-    """
-    if len(values) == 0:
-        raise ValueError("expected the value of at least one seed")
-    mean = float(np.mean(values))
-    if len(values) == 1:
-        return MeanOverSeeds(mean, None, None, None, 1)
-    deviation = float(np.std(values, ddof=1))
-    half = float(scipy.stats.t.ppf(0.5 + confidence / 2, len(values) - 1)) * deviation / math.sqrt(len(values))
-    return MeanOverSeeds(mean, mean - half, mean + half, deviation, len(values))
-
-
-@dataclass(frozen=True)
 class Interval:
     """A number with its interval.
 

@@ -10,7 +10,6 @@ from graspq.evaluate.statistics import (
     bootstrap_interval,
     crossed_draws,
     holm,
-    mean_over_seeds,
     mean_success,
     object_counts,
     object_variance,
@@ -87,21 +86,6 @@ def test_paired_difference_refuses_lists_of_different_scenes() -> None:
         paired_difference([True, False], [True])
     with pytest.raises(ValueError, match="equally long"):
         paired_difference([], [])
-
-
-def test_mean_over_seeds_is_students_interval() -> None:
-    result = mean_over_seeds([0.60, 0.64, 0.62])
-    assert result.mean == pytest.approx(0.62)
-    assert result.deviation == pytest.approx(0.02)
-    assert result.high is not None
-    assert result.high - result.mean == pytest.approx(4.302652729911275 * 0.02 / math.sqrt(3), rel=1e-9)
-
-
-def test_mean_over_one_seed_has_no_interval_and_over_none_is_refused() -> None:
-    single = mean_over_seeds([0.5])
-    assert (single.mean, single.low, single.high, single.deviation, single.seeds) == (0.5, None, None, None, 1)
-    with pytest.raises(ValueError, match="at least one seed"):
-        mean_over_seeds([])
 
 
 # Three runs, four scenes. Means: of the runs 1, 3/4, 1/4; of the scenes 1, 2/3, 2/3, 1/3.
