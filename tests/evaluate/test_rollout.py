@@ -92,8 +92,8 @@ def test_episodes_of_a_worker_that_died_are_played_again_with_the_same_result(
 
 
 def test_a_missing_split_is_the_users_mistake_also_when_a_worker_finds_it(objects_folder: Path) -> None:
-    with pytest.raises(UserError, match="split 'validation'"):
-        rolled(Rollouts(scenes(objects_folder, split="validation"), RandomPolicy()), 1)
+    with pytest.raises(UserError, match="split 'nowhere'"):
+        rolled(Rollouts(scenes(objects_folder, split="nowhere"), RandomPolicy()), 1)
 
 
 def test_a_trained_policy_gives_the_same_rows_with_one_worker_and_two(objects_folder: Path, run_folder: Path) -> None:

@@ -113,7 +113,7 @@ def test_the_actor_clones_logged_actions_by_the_exponential_of_their_advantage()
     )[0]
     # V is the mean of Q, 1.9: advantages -0.7 and 0.7.
     good, bad = np.exp(0.7), np.exp(-0.7)
-    assert float(actor[0, 0]) == pytest.approx((0.6 * good - 0.8 * bad) / (good + bad), abs=0.01)
+    assert float(actor[0, 0].detach()) == pytest.approx((0.6 * good - 0.8 * bad) / (good + bad), abs=0.01)
     assert actor[0, 1:].tolist() == pytest.approx([0, 0, 0], abs=0.01)
 
 
