@@ -185,9 +185,9 @@ def corrected_episode_value(
         y_t = Σ_{t'=t}^{T} γ^{t'-t} r_t' - ν Σ_{t'=t+1}^{T} γ^{t'-t} A(s_t', a_t'),
         by the recursion  y_t = r_t + γ (y_{t+1} - ν A_{t+1}),  y_{T+1} = A_{T+1} = 0
 
-    With ν = 1 and A = Q - V of the best policy its mean is that policy's Q; with ν = 0 it is the observed return. No
-    such advantage is larger than 0: unless it was centred, the correction can only raise the target, and with rewards
-    of at most 1 above 1. It must not be clipped: the mean of clipped targets is not the clipped mean.
+    With ν = 1 and A = Q - V of the best policy its mean is that policy's Q; with ν = 0 it is the observed return. That
+    exact A is never above 0, so its correction can only raise the target, with rewards of at most 1 above 1; an
+    estimate of it may do either. Targets must not be clipped: the mean of clipped targets is not the clipped mean.
 
     Args:
         reward: float [B, T], whole episodes.

@@ -135,7 +135,7 @@ def opc(q: Floats, success: npt.NDArray[np.bool_]) -> float | None:
     """Return OPC, how well a threshold on Q tells steps from which a success can follow from those where it cannot.
 
     Every step of a success is known to be one from which success can follow (positive); of all others nothing is known
-    (unlabelled). With 𝟙 an indicator, p = 1 as in tasks that can be solved from every first state, and the best b,
+    (unlabelled). With 𝟙 an indicator, the best b, and p = 1 for the unknown share of positive steps, as they simplify,
 
         OPC = max_b (p E[𝟙(Q > b) | success] - E[𝟙(Q > b)]).
 
