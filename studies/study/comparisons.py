@@ -10,8 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from graspq.common.errors import UserError
 from graspq.evaluate.results_table import outcomes_of
 from graspq.evaluate.statistics import SeveralRuns, holm, mean_success, object_counts, success_difference
+
+# What all scores at a place must agree in, and besides it all runs of one row there; keys of the table of scores.
+OF_A_PLACE = {"episodes": "numbers of episodes", "object_set_sha256": "object sets", "simulator": "simulator versions"}
+OF_A_ROW = {"recipe_sha256": "recipes", "data_sha256": "datasets"}
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class Scored:
     Attributes:
         name: of the row.
         algo: its estimator.
-        rows: of the table of scores, those that are done, one a seed.
+        rows: of the table of scores, those that are done, one a seed; none where all failed.
         asked: how many runs there should be.
         failures: why runs failed, a line each.
         counts: objects in the scenes, float [N, O]; None where that is not known.
@@ -65,33 +70,91 @@ class Scored:
         return mean_success(self.success, self.counts)
 
     @property
+    def lacking(self) -> str:
+        """How many of its trainings failed or are not done yet, in words; empty where all are done."""
+        if self.failures:
+            return f"{len(self.failures)} of {self.asked} trainings failed"
+        return f"{len(self.rows)} of {self.asked} trainings done" if len(self.rows) < self.asked else ""
+
+    @property
     def rates(self) -> list[float]:
         """The success rate of each run."""
         return [float(row["success_rate"]) for row in self.rows]
+
+    def same_scenes(self, other: "Scored") -> bool:
+        """Return whether another row met the same scenes: as many, of one object set, in one simulator's version."""
+        return all(self.rows[0].get(key) == other.rows[0].get(key) for key in OF_A_PLACE)
 
     def less(self, other: "Scored") -> SeveralRuns:
         """Return how much higher its mean success is than that of another row on the same scenes."""
         return success_difference(self.success, other.success, self.counts)
 
 
-def scored_rows(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, Scored]]:
-    """Return the rows of a table of scores by place and name, in the order of the table; those without a run not."""
-    scenes = {(one["task"], one["split"]): object_counts(one["object_ids"]) for one in table if one["kind"] == "scenes"}
-    grouped: dict[tuple[Place, str], list[dict[str, Any]]] = {}
+def asked_rows(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, Scored]]:
+    """Return the rows of a table of scores by place and name, in the order of the table, those that were begun.
+
+    Raises:
+        UserError: runs under one name have two recipes or datasets, or a seed twice; or runs at one place were scored
+            on different scenes.
+    """
+    scenes = {
+        (one["task"], one["split"], len(one["object_ids"])): object_counts(one["object_ids"])
+        for one in table
+        if one["kind"] == "scenes"
+    }
+    grouped: dict[Place, dict[str, list[Mapping[str, Any]]]] = {}
     for one in table:
         if one["kind"] == "run":
             place = Place(one["task"], one["size"], one["setting"], one["split"])
-            grouped.setdefault((place, one["row"]), []).append(dict(one))
+            grouped.setdefault(place, {}).setdefault(one["row"], []).append(one)
     found: dict[Place, dict[str, Scored]] = {}
-    for (place, name), some in grouped.items():
-        done = [one for one in some if one["status"] == "done"]
-        failures = tuple(f"seed {one['seed']}: {one['reason']}" for one in some if one["status"] == "failed")
-        if done:
-            counts = scenes.get((place.task, place.split))
-            known = counts if counts is not None and len(counts) == done[0]["episodes"] else None
-            row = Scored(name, done[0]["algo"], tuple(done), len(some), failures, known)
-            found.setdefault(place, {})[name] = row
+    for place, here in grouped.items():
+        for name, some in here.items():
+            _require_one_row(place, name, some)
+            done = tuple(dict(one) for one in some if one["status"] == "done")
+            failures = tuple(f"seed {one['seed']}: {one['reason']}" for one in some if one["status"] == "failed")
+            if done or failures:
+                counts = scenes.get((place.task, place.split, done[0]["episodes"])) if done else None
+                row = Scored(name, some[0]["algo"], done, len(some), failures, counts)
+                found.setdefault(place, {})[name] = row
+        _require_same_scenes(place, [row for row in found.get(place, {}).values() if row.rows])
     return found
+
+
+def _require_one_row(place: Place, name: str, runs: Sequence[Mapping[str, Any]]) -> None:
+    for key, what in OF_A_ROW.items():
+        known = {one[key]: one["study"] for one in runs if one.get(key) is not None}
+        if len(known) > 1:
+            told = ", ".join(f"{digest[:8]} of study {study}" for digest, study in known.items())
+            raise UserError(
+                f"row {name!r} ({place}): expected runs of one recipe and dataset, got {len(known)} {what} ({told}); "
+                "give one of them a name of its own in its plan, or leave it out of --beside"
+            )
+    seeds = [one["seed"] for one in runs]
+    twice = next((seed for seed in seeds if seeds.count(seed) > 1), None)
+    if twice is not None:
+        raise UserError(f"row {name!r} ({place}): seed {twice} stands there twice; leave one out of --beside")
+
+
+def _require_same_scenes(place: Place, rows: Sequence[Scored]) -> None:
+    for key, what in OF_A_PLACE.items():
+        known = {str(one.get(key)): f"{row.name!r} of study {one['study']}" for row in rows for one in row.rows}
+        if len(known) > 1:
+            told = ", ".join(f"{value[:24]} with row {row}" for value, row in known.items())
+            raise UserError(
+                f"{place}: expected scores on the same scenes, got {len(known)} {what} ({told}); score one of them "
+                "again, or leave it out of --beside"
+            )
+
+
+def scored_rows(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, Scored]]:
+    """Return those of `asked_rows` that have a run that is done.
+
+    Raises:
+        UserError: as `asked_rows` does.
+    """
+    done = {place: {name: row for name, row in here.items() if row.rows} for place, here in asked_rows(table).items()}
+    return {place: here for place, here in done.items() if here}
 
 
 def trainings(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, list[tuple[str, float]]]]:
@@ -150,5 +213,5 @@ def compare(pairs: Sequence[tuple[Scored, Scored]]) -> list[Compared]:
 def against_the_best(rows: Mapping[str, Scored]) -> dict[str, Compared]:
     """Return every other row against the one of the highest mean, by name."""
     best = max(rows.values(), key=lambda one: one.mean.value)
-    others = [one for one in rows.values() if one is not best and one.success.shape[1] == best.success.shape[1]]
+    others = [one for one in rows.values() if one is not best]
     return {one.first: one for one in compare([(other, best) for other in others])}

@@ -11,7 +11,15 @@ from graspq.common.files import write_text
 from graspq.common.text import markdown, write_jsonl
 from graspq.evaluate.statistics import rank_correlation, wilson_interval
 from graspq.studies.study.claims import judged
-from graspq.studies.study.comparisons import Compared, Place, Scored, against_the_best, scored_rows, trainings
+from graspq.studies.study.comparisons import (
+    Compared,
+    Place,
+    Scored,
+    against_the_best,
+    asked_rows,
+    scored_rows,
+    trainings,
+)
 from graspq.studies.study.figures import write_figures
 
 Table = Sequence[Mapping[str, Any]]
@@ -116,15 +124,14 @@ def row_table(rows: Mapping[Place, Mapping[str, Scored]], table: Table) -> str:
     heads = ["row", "task", "grasps", "success", "95 % interval", "each seed", "less the best", "p (Holm)"]
     text = markdown([*heads, "discount", "steps", "recipe"], lines)
     missing = [
-        f"`{row.name}` ({place}): {len(row.rows)} of {row.asked} seeds" + "".join(f"; {one}" for one in row.failures)
-        for place, here in rows.items()
+        f"`{row.name}` ({place}): {row.lacking}" + "".join(f"; {one}" for one in row.failures)
+        for place, here in asked_rows(table).items()
         for row in here.values()
-        if len(row.rows) < row.asked
+        if row.lacking
     ]
-    unscored = sorted(
-        {one["row"] for one in table if one["kind"] == "run"} - {name for here in rows.values() for name in here}
-    )
-    missing += [f"`{name}`: not run" for name in unscored]
+    begun = {row for here in asked_rows(table).values() for row in here}
+    unbegun = sorted({one["row"] for one in table if one["kind"] == "run"} - begun)
+    missing += [f"`{name}`: not run" for name in unbegun]
     return text + ("\nNot whole: " + ". ".join(missing) + ".\n" if missing else "")
 
 
@@ -137,8 +144,9 @@ def _row(place: Place, row: Scored, compared: Compared | None) -> list[str]:
         p = f"{compared.p_value:.3f}" if compared.p_value >= 0.001 else "< 0.001"
     size = place.size if place.setting == "off-policy" else f"{place.size}, {place.setting}"
     discount = first.get("discount")
+    name = f"`{row.name}`" + (f" ({row.lacking})" if row.lacking else "")
     return [
-        f"`{row.name}`", place.task, size, f"{mean.value:.3f}", f"{mean.low:.3f} to {mean.high:.3f}",
+        name, place.task, size, f"{mean.value:.3f}", f"{mean.low:.3f} to {mean.high:.3f}",
         " ".join(f"{rate:.3f}" for rate in row.rates), difference, p,
         f"{discount:g}" if discount is not None else "", f"{first['steps']:,}", f"`{first['recipe_sha256'][:8]}`",
     ]  # fmt: skip

@@ -59,6 +59,8 @@ def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
         row["data_sha256"] = run.config.get("dataset", {}).get("manifest_sha256")
         row["trained_by"] = run.config.get("code_revision")
         validations = [one["validation"] for one in run.metrics() if "validation" in one]
+        if "online" in run.config:
+            row["fresh_grasps"] = sum(one["online"]["grasps"] for one in run.metrics() if "online" in one)
         row["validation"] = validations[-1] if validations else None
     return row | (_score(state.evaluation) if state.evaluation is not None else {})
 

@@ -5,14 +5,14 @@ from typing import Any
 import pytest
 
 from graspq.studies.study import claims
-from graspq.studies.study.comparisons import scored_rows, trainings
+from graspq.studies.study.comparisons import asked_rows, trainings
 from tests.studies.study.scored_studies import runs, scenes, study
 
 BEST = {"dql": 0.95, "mc": 0.8, "corr_mc": 0.85, "supervised": 0.85, "ddpg": 0.7, "pcl": 0.5}
 
 
 def verdict(claim: Any, table: list[dict[str, Any]]) -> str:
-    found = trainings(table) if claim is claims.actor_unstable else scored_rows(table)
+    found = trainings(table) if claim is claims.actor_unstable else asked_rows(table)
     return str(claim(found).verdict)
 
 
@@ -22,6 +22,27 @@ def verdict(claim: Any, table: list[dict[str, Any]]) -> str:
 )
 def test_dql_is_best_in_low_data_where_it_is_better_than_every_other(changed: dict[str, float], expected: str) -> None:
     assert verdict(claims.dql_best_in_low_data, study(**BEST | changed)) == expected
+
+
+def test_dql_need_not_beat_supervised_learning_in_low_data() -> None:
+    assert verdict(claims.dql_best_in_low_data, study(**BEST | {"supervised": 0.98})) == "holds"
+
+
+def test_scores_on_validation_decide_no_claim_but_that_of_stability() -> None:
+    table = [row | {"split": "validation"} for row in study(**BEST)]
+    assert {one.verdict for one in claims.judged(table)} == {"not tested"}
+
+
+def test_a_row_of_which_a_training_failed_is_not_judged_by_those_that_are_left() -> None:
+    table = study(**BEST) + runs("ddpg", 0.0, seeds=1, seed=3, status="failed", reason="diverged")
+    for claim in (claims.dql_best_in_low_data, claims.actor_worse, claims.ninety_percent):
+        found = claim(asked_rows(table))
+        assert (found.verdict, found.seen) == ("not tested", "`ddpg`: 1 of 4 trainings failed")
+    assert verdict(claims.supervised_competitive, table) == "not decided"  # it asks nothing of ddpg
+    gone = [row | {"status": "failed", "reason": "diverged"} if row.get("row") == "ddpg" else row for row in table]
+    assert claims.dql_best_in_low_data(asked_rows(gone)).seen == "`ddpg`: 4 of 4 trainings failed"
+    begun = study(**BEST) + runs("mc", 0.0, seeds=1, seed=3, status="to do")
+    assert claims.bias_of_mc(asked_rows(begun)).seen == "`mc`: 3 of 4 trainings done"
 
 
 def test_low_data_are_ten_thousand_grasps() -> None:
@@ -42,6 +63,11 @@ def test_the_bias_of_mc_is_disastrous_where_it_costs_a_tenth(mc: float, expected
     assert verdict(claims.bias_of_mc, study(**BEST | {"mc": mc})) == expected
 
 
+def test_the_discounted_returns_of_mc_are_judged_too_where_they_were_run() -> None:
+    table = study(**BEST | {"mc": 0.93}) + runs("mc-discount0.9", 0.6, algo="mc")
+    assert verdict(claims.bias_of_mc, table) == "fails"
+
+
 @pytest.mark.parametrize(("rate", "expected"), [(0.95, "holds"), (0.7, "fails")])
 def test_supervised_is_competitive_within_a_margin(rate: float, expected: str) -> None:
     assert verdict(claims.supervised_competitive, study(**BEST | {"supervised": rate})) == expected
@@ -50,8 +76,21 @@ def test_supervised_is_competitive_within_a_margin(rate: float, expected: str) -
 def test_on_policy_is_judged_where_a_row_was_scored_both_ways() -> None:
     table = study(**BEST)
     assert verdict(claims.on_policy_slight, table) == "not tested"
-    assert verdict(claims.on_policy_slight, [*table, *runs("dql", 0.95, setting="on-policy")]) == "holds"
-    assert verdict(claims.on_policy_slight, [*table, *runs("dql", 0.7, setting="on-policy")]) == "fails"
+    fresh = {"setting": "on-policy", "fresh_grasps": 3000}
+    assert verdict(claims.on_policy_slight, [*table, *runs("dql", 0.95, **fresh)]) == "holds"
+    assert verdict(claims.on_policy_slight, [*table, *runs("dql", 0.7, **fresh)]) == "fails"
+
+
+@pytest.mark.parametrize("changed", [{"object_set_sha256": "e" * 64}, {"simulator": "pybullet 4"}])
+def test_on_policy_is_not_tested_where_no_row_met_the_same_scenes_both_ways(changed: dict[str, str]) -> None:
+    rows = runs("dql", 0.95, setting="on-policy", fresh_grasps=3000, **changed)
+    assert verdict(claims.on_policy_slight, [*study(**BEST), *rows]) == "not tested"
+
+
+def test_on_policy_is_not_tested_where_a_hundredth_of_the_grasps_is_fresh() -> None:
+    rows = runs("dql", 0.95, setting="on-policy", fresh_grasps=150)
+    found = claims.on_policy_slight(asked_rows([*study(**BEST), *rows]))
+    assert (found.verdict, found.seen) == ("not tested", "of the data, 1.5% are fresh grasps")
 
 
 @pytest.mark.parametrize(("ddpg", "expected"), [(0.7, "holds"), (0.9, "fails")])
@@ -76,5 +115,7 @@ def test_stability_needs_variants_and_counts_a_failure_as_nothing() -> None:
 @pytest.mark.parametrize(("rate", "expected"), [(0.98, "holds"), (0.8, "fails"), (0.91, "not decided")])
 def test_ninety_percent_is_asked_of_the_best_rows_interval_on_test(rate: float, expected: str) -> None:
     assert verdict(claims.ninety_percent, study(dql=rate, mc=0.5)) == expected
+    assert "picked as the best of 2" in claims.ninety_percent(asked_rows(study(dql=rate, mc=0.5))).seen
+    assert "picked" not in claims.ninety_percent(asked_rows(study(dql=rate))).seen
     on_validation = [row | {"split": "validation"} for row in study(dql=rate)]
     assert verdict(claims.ninety_percent, on_validation) == "not tested"

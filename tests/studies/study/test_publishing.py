@@ -28,10 +28,20 @@ def test_a_study_gets_a_section_of_its_own_that_takes_the_place_of_the_older_one
     (best,) = [line for line in lines if line.startswith("| `dql`")]
     (other,) = [line for line in lines if line.startswith("| `mc`")]
     assert lines.index(best) < lines.index(other) and "| < 0.001 | 0.9 | 100 | `cccccccc` |" in other
-    assert "9 of 10 trainings, of a frozen recipe, scored on `test`" in text and "`pcl`: not run" in text
+    assert (
+        "9 of 10 trainings, of a frozen recipe, scored on `test`" in text
+        and "`pcl` (regular, 10k, off-policy, test): 1 of 1 trainings failed; seed 0: diverged" in text
+    )
     assert text.count("| **not tested** |") >= 2 and "| `roc_auc` |" in text
     assert "](results/study-s.jsonl)" in text and matplotlib.image.imread(results / "figures/study-s.png").size
     assert read_scores([results / "study-s.jsonl"]) == table
+
+
+def test_a_row_says_itself_how_many_of_its_trainings_failed(tmp_path: Path) -> None:
+    table = study(dql=0.9, ddpg=0.5) + runs("ddpg", 0.5, seeds=1, seed=3, status="failed", reason="diverged")
+    publish("s", PLAN, table + runs("pcl", 0.5, status="to do"), [], tmp_path, tmp_path / "RESULTS.md")
+    text = (tmp_path / "RESULTS.md").read_text()
+    assert "| `ddpg` (1 of 4 trainings failed) |" in text and "| `dql` |" in text and "`pcl`: not run" in text
 
 
 def test_scores_of_validation_are_named_as_those_that_were_chosen_on(tmp_path: Path) -> None:
