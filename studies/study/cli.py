@@ -126,7 +126,8 @@ def _publish(settings: PublishSettings) -> None:
     kept = settings.results / f"study-{plan.name}.jsonl"
     here = settings.folder.is_dir()
     table = write_scores(plan, settings.folder, cells) if here else read_scores([kept])
-    written = publish(plan.name, plan.path, table, read_scores(settings.beside), settings.results, settings.page)
+    beside, reference = read_scores(settings.beside), plan.values["reference"]
+    written = publish(plan.name, plan.path, table, beside, settings.results, settings.page, reference)
     click.echo(f"wrote {', '.join(path.as_posix() for path in written)}")
 
 

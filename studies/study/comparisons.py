@@ -210,8 +210,18 @@ def compare(pairs: Sequence[tuple[Scored, Scored]]) -> list[Compared]:
     ]
 
 
-def against_the_best(rows: Mapping[str, Scored]) -> dict[str, Compared]:
-    """Return every other row against the one of the highest mean, by name."""
-    best = max(rows.values(), key=lambda one: one.mean.value)
-    others = [one for one in rows.values() if one is not best]
-    return {one.first: one for one in compare([(other, best) for other in others])}
+def against(rows: Mapping[str, Scored], reference: str | None = None) -> dict[str, Compared]:
+    """Return every other row against one, by name.
+
+    Args:
+        rows: of one place, by name.
+        reference: name of the one; the row of the highest mean where it is None or not there.
+    """
+    one = rows.get(reference or "") or max(rows.values(), key=lambda row: row.mean.value)
+    return {found.first: found for found in compare([(other, one) for other in rows.values() if other is not one])}
+
+
+def unequal_steps(rows: Mapping[str, Scored]) -> bool:
+    """Return whether the rows of the paper's preset had unequal numbers of steps, so that none tells of another."""
+    runs = [row.rows[0] for row in rows.values()]
+    return len({one["steps"] for one in runs if one["options"].get("preset") == "paper"}) > 1

@@ -29,6 +29,7 @@ KEYS: dict[str, tuple[tuple[type, ...], Any, str]] = {
     "split": ((str,), "validation", "a split of the object set"),
     "episodes": ((int,), 1000, "a number of grasps that each run is scored on"),
     "policies": ((list,), ["random", "oracle"], "a list of policies to score beside the rows"),
+    "reference": ((str,), None, "the name of a row"),
     "recipe": ((str,), None, "the file of a frozen recipe"),
     "data": ((str,), "data", "a folder of datasets"),
     "engine": ((str,), "local", "local or ray"),
@@ -143,6 +144,8 @@ def read_plan(path: Path) -> StudyPlan:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UserError(f"{path}: two rows are called {twice!r}; give one of them a name of its own")
+    if values["reference"] not in (None, *names):
+        raise UserError(f"{path}: reference = {values['reference']!r}; expected a row: {', '.join(names)}")
     return StudyPlan(path, rows, tuple(map(str, values["sizes"])), values)
 
 

@@ -1,6 +1,5 @@
 """What a study shows: its section of RESULTS.md, with tables of rows, differences and claims, and its figures."""
 
-import itertools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,23 +8,34 @@ from typing import Any
 from graspq.common.errors import UserError
 from graspq.common.files import write_text
 from graspq.common.text import markdown, write_jsonl
-from graspq.evaluate.statistics import rank_correlation, wilson_interval
+from graspq.evaluate.choosing import ScoredCheckpoint, choosing
+from graspq.evaluate.statistics import wilson_interval
 from graspq.studies.study.claims import judged
 from graspq.studies.study.comparisons import (
     Compared,
     Place,
     Scored,
-    against_the_best,
+    against,
     asked_rows,
     scored_rows,
     trainings,
+    unequal_steps,
 )
 from graspq.studies.study.figures import write_figures
 
 Table = Sequence[Mapping[str, Any]]
+Rows = Mapping[Place, Mapping[str, Scored]]
 
 
-def publish(study: str, plan: Path, table: Table, beside: Table, results: Path, page: Path | None) -> list[Path]:
+def publish(
+    study: str,
+    plan: Path,
+    table: Table,
+    beside: Table,
+    results: Path,
+    page: Path | None,
+    reference: str | None = None,
+) -> list[Path]:
     """Write the scores, the figures and the section of a page; return what was written.
 
     Args:
@@ -35,6 +45,7 @@ def publish(study: str, plan: Path, table: Table, beside: Table, results: Path, 
         beside: scores of other studies, that claims are judged by too.
         results: folder of scores and figures.
         page: the page, which is made or gets the section at its end where it has none yet; None for none.
+        reference: name of the row that differences are to; the best where it is None.
 
     Raises:
         UserError: no run is scored yet.
@@ -48,7 +59,7 @@ def publish(study: str, plan: Path, table: Table, beside: Table, results: Path, 
     written = [scores, *figures]
     if page is not None:
         files = [Path(os.path.relpath(path, page.parent)) for path in (scores, *figures)]
-        text = section(study, plan, table, beside, files)
+        text = section(study, plan, table, beside, files, reference)
         write_text(page, with_section(page.read_text() if page.exists() else "", study, text))
         written.append(page)
     return written
@@ -64,16 +75,24 @@ def with_section(text: str, study: str, section: str) -> str:
     return before + made + rest.partition(end)[2]
 
 
-def section(study: str, plan: Path, table: Table, beside: Table, files: Sequence[Path]) -> str:
+def section(
+    study: str, plan: Path, table: Table, beside: Table, files: Sequence[Path], reference: str | None = None
+) -> str:
     """Return the section of a study in Markdown: facts, the table of rows, figures, claims."""
     rows = scored_rows(table)
     scores, *figures = files
-    parts = [f"## Study {study}\n", facts(plan, table, scores), row_table(rows, table)]
+    parts = [f"## Study {study}\n", facts(plan, table, scores), row_table(rows, table, reference)]
     parts += [f"![Success by row of study {study}]({path.as_posix()})\n" for path in figures]
-    correlations = correlation_table(table)
-    if correlations:
-        parts += ["### Choosing without a simulator\n", correlations]
-    parts += ["### The claims of the paper\n", claim_table([*table, *beside])]
+    found = choosing_table(rows)
+    if found:
+        parts += ["### Choosing without a simulator\n", found]
+    if any(unequal_steps(here) for here in rows.values()):
+        parts.append(
+            "No row is tested against another, and no claim is judged: these are the paper's settings with unequal "
+            "numbers of steps.\n"
+        )
+    else:
+        parts += ["### The claims of the paper\n", claim_table([*table, *beside])]
     return "\n".join(parts)
 
 
@@ -107,12 +126,12 @@ def references(table: Table) -> dict[str, list[Mapping[str, Any]]]:
     return found
 
 
-def row_table(rows: Mapping[Place, Mapping[str, Scored]], table: Table) -> str:
-    """Return the table by task, size and row, best first, with each row's difference to the best."""
+def row_table(rows: Rows, table: Table, reference: str | None = None) -> str:
+    """Return the table by task, size and row, best first, with each row's difference to the best or to `reference`."""
     lines = []
     beside, told = references(table), set[str]()
     for place, here in rows.items():
-        compared = against_the_best(here)
+        compared = {} if unequal_steps(here) else against(here, reference)
         for row in sorted(here.values(), key=lambda one: -one.mean.value):
             lines.append(_row(place, row, compared.get(row.name)))
         for one in beside.get(place.task, []) if place.task not in told else []:
@@ -121,7 +140,16 @@ def row_table(rows: Mapping[Place, Mapping[str, Scored]], table: Table) -> str:
                 [one["policy"], place.task, "", f"{one['success_rate']:.3f}", f"{low:.3f} to {high:.3f}", *[""] * 6]
             )
         told.add(place.task)
-    heads = ["row", "task", "grasps", "success", "95 % interval", "each seed", "less the best", "p (Holm)"]
+    heads = [
+        "row",
+        "task",
+        "grasps",
+        "success",
+        "95 % interval",
+        "each seed",
+        f"less {reference or 'the best'}",
+        "p (Holm)",
+    ]
     text = markdown([*heads, "discount", "steps", "recipe"], lines)
     missing = [
         f"`{row.name}` ({place}): {row.lacking}" + "".join(f"; {one}" for one in row.failures)
@@ -152,20 +180,26 @@ def _row(place: Place, row: Scored, compared: Compared | None) -> list[str]:
     ]  # fmt: skip
 
 
-def correlation_table(table: Table) -> str:
-    """Return how well held-back numbers rank the runs by their success; empty where there are fewer than five runs."""
-    runs = [one for one in table if one["kind"] == "run" and one["status"] == "done" and one.get("validation")]
-    names = dict.fromkeys(itertools.chain.from_iterable(one["validation"] for one in runs))
+def choosing_table(rows: Rows) -> str:
+    """Return how well held-back measures order the runs of a place, and of an estimator there; empty without any."""
     lines = []
-    for name in names:
-        pairs = [(one["validation"].get(name), one["success_rate"]) for one in runs]
-        known = [
-            (value, rate) for value, rate in pairs if isinstance(value, int | float) and not isinstance(value, bool)
+    for place, here in rows.items():
+        runs = [
+            ScoredCheckpoint(row.algo, one["validation"], float(one["success_rate"]))
+            for row in here.values()
+            for one in row.rows
+            if one.get("validation")
         ]
-        if len(known) >= 5:
-            correlation = rank_correlation(*zip(*known, strict=True))
-            lines.append([f"`{name}`", f"{correlation:+.2f}" if correlation is not None else "", str(len(known))])
-    return markdown(["last validation", "Spearman's ρ with success", "runs"], lines) if lines else ""
+        lines += [
+            [one.words, str(place), _rho(one.within), _rho(one.correlation), str(one.checkpoints)]
+            for one in choosing(runs)
+        ]
+    heads = ["held-back measure", "at", "Spearman's ρ with success within an estimator", "over all", "runs"]
+    return markdown(heads, lines) if lines else ""
+
+
+def _rho(correlation: float | None) -> str:
+    return f"{correlation:+.2f}" if correlation is not None else ""
 
 
 def claim_table(table: Table) -> str:

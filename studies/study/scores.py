@@ -16,6 +16,7 @@ from graspq.studies.study.cells import Cell
 from graspq.studies.study.freezing import key_of, read_recipe
 from graspq.studies.study.plan_file import StudyPlan
 from graspq.studies.sweep.trial import SCENES_SEED, run_in
+from graspq.train.run import Run
 
 SCORES_FILE = "study.jsonl"
 OF_AN_EVALUATION = (
@@ -59,10 +60,14 @@ def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
         row["data_sha256"] = run.config.get("dataset", {}).get("manifest_sha256")
         row["trained_by"] = run.config.get("code_revision")
         validations = [one["validation"] for one in run.metrics() if "validation" in one]
-        if "online" in run.config:
-            row["fresh_grasps"] = sum(one["online"]["grasps"] for one in run.metrics() if "online" in one)
+        row["fresh_grasps"] = fresh_grasps(run)
         row["validation"] = validations[-1] if validations else None
     return row | (_score(state.evaluation) if state.evaluation is not None else {})
+
+
+def fresh_grasps(run: Run) -> int:
+    """Return how many grasps of its own policies a run has added to its data; 0 where it was trained off-policy."""
+    return max((one["online"]["grasps_so_far"] for one in run.metrics() if "online" in one), default=0)
 
 
 def _score(evaluation: Evaluation) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.studies.study.comparisons import Place, against_the_best, scored_rows
+from graspq.studies.study.comparisons import Place, against, scored_rows
 from tests.studies.study.scored_studies import runs, study
 
 PLACE = Place("regular", "10k", "off-policy", "test")
@@ -45,8 +45,13 @@ def test_what_is_not_one_row_on_the_same_scenes_is_refused(changed: dict[str, An
 
 
 def test_the_others_are_compared_with_the_best_row() -> None:
-    found = against_the_best(scored_rows(study(dql=0.9, mc=0.7, corr_mc=0.9))[PLACE])
+    found = against(scored_rows(study(dql=0.9, mc=0.7, corr_mc=0.9))[PLACE])
     assert found["mc"].worse and not found["mc"].better
     (other,) = set(found) - {"mc"}
     assert not found[other].worse and found["mc"].second != other
     assert str(found["mc"]).startswith(f"mc − {found['mc'].second}: -0.1")
+
+
+def test_a_named_row_takes_the_place_of_the_best() -> None:
+    found = against(scored_rows(study(dql=0.9, mc=0.7, pcl=0.8))[PLACE], "mc")
+    assert {(one.first, one.second, one.better) for one in found.values()} == {("dql", "mc", True), ("pcl", "mc", True)}

@@ -6,6 +6,7 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.studies.study.cells import cells_of
+from graspq.studies.study.claims import FEWEST_POINTS, LEAST_FRESH
 from graspq.studies.study.plan_file import read_plan
 
 PLANS = Path(__file__).resolve().parents[3] / "studies" / "plans"
@@ -47,6 +48,7 @@ def test_a_row_with_the_papers_preset_has_the_papers_steps(tmp_path: Path) -> No
         ("rows = ['mc']\nsizes = ['10k']\nsetting = 'off'", "setting = 'off'; expected off-policy or on-policy"),
         ("rows = ['mc']\nsizes = ['10k']\nsplits = 'test'", "unknown key 'splits'"),
         ("rows = ['mc']\nsizes = ['10k']\npolicies = ['best']", "'best' is unknown"),
+        ("rows = ['mc', 'dql']\nsizes = ['10k']\nreference = 'pcl'", "reference = 'pcl'; expected a row: mc, dql"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_the_file(text: str, said: str, tmp_path: Path) -> None:
@@ -61,3 +63,28 @@ def test_the_plans_that_ship_have_rows_whose_options_there_are(path: Path) -> No
     plan = read_plan(path)
     cells = [cell for cell in cells_of(plan, Path("study"), workers=1) if cell.seed == 0]
     assert len({cell.digest for cell in cells}) == len(plan.rows) * len(plan.sizes)
+
+
+def test_a_name_is_one_recipe_over_all_plans_that_ship() -> None:
+    digests: dict[tuple[str, ...], set[str]] = {}
+    for path in PLANS.glob("*.toml"):
+        plan = read_plan(path)
+        for cell in cells_of(plan, Path("study"), workers=1):
+            place = (cell.row, cell.task, cell.size, plan.values["setting"], plan.split)
+            digests.setdefault(place, set()).add(cell.digest)
+    assert [place for place, some in digests.items() if len(some) > 1] == []
+
+
+def test_the_plan_of_fresh_grasps_asks_for_a_tenth_of_the_data_and_lets_exploration_fall_to_its_end() -> None:
+    plan = read_plan(PLANS / "on-policy.toml")
+    cell = cells_of(plan, Path("study"), workers=1)[0]
+    rounds = cell.deciding["online"]
+    fresh = rounds["rounds"] * rounds["grasps"]
+    assert fresh / (fresh + 10_000) >= LEAST_FRESH
+    assert rounds["exploration_steps"] <= (rounds["rounds"] - 1) * rounds["steps_per_round"]
+
+
+def test_the_plan_of_stability_has_as_many_trainings_of_both_kinds_as_the_claim_asks_for() -> None:
+    plan = read_plan(PLANS / "stability.toml")
+    algos = [cell.algo for cell in cells_of(plan, Path("study"), workers=1)]
+    assert all(algos.count(algo) >= FEWEST_POINTS for algo in ("ddpg", "dql", "mc"))
