@@ -48,9 +48,11 @@ def publish(
         reference: name of the row that differences are to; the best where it is None.
 
     Raises:
-        UserError: no run is scored yet.
+        UserError: no run is scored yet, or what stands beside cannot be judged together, see `asked_rows`; nothing was
+            written then.
     """
     rows = scored_rows(table)
+    asked_rows([*table, *beside])
     if not rows:
         raise UserError(f"{study}: no run is scored yet; run: grasp-study run {plan}")
     scores = results / f"study-{study}.jsonl"

@@ -100,6 +100,13 @@ def test_a_study_without_a_score_is_refused_and_so_is_what_is_no_study(tmp_path:
             read_scores([tmp_path / "a.jsonl"])
 
 
+def test_scores_that_are_no_rows_beside_these_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    beside = runs("dql", 0.7, recipe_sha256="e" * 64, study="paper")
+    with pytest.raises(UserError, match="2 recipes"):
+        publish("s", PLAN, study(dql=0.9), beside, tmp_path, tmp_path / "RESULTS.md")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_sections_of_two_studies_live_side_by_side() -> None:
     page = with_section(with_section("A\n", "one", "1"), "two", "2")
     assert with_section(page, "one", "3") == page.replace("\n1\n", "\n3\n")

@@ -60,6 +60,11 @@ def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
     assert grasp_study("report", "tiny.toml", "--out", "elsewhere") == 0  # judged again without the runs
     assert Path("RESULTS.md").read_text() == page
     assert {path: sha256_of(path) for path in Path("study").rglob("eval.json")} == before
+    capfd.readouterr()
+    words_beside = ["report", "tiny.toml", "--out", "elsewhere", "--beside", "results/study-tiny.jsonl"]
+    assert grasp_study(*words_beside) == 2  # the same runs again
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert "seed 0 stands there twice" in line
 
     plan(("batch_size = 8", "batch_size = 4"), data=data)
     assert grasp_study(*words) == 2
