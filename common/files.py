@@ -11,6 +11,7 @@ import os
 import shutil
 import socket
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,24 @@ def read_json(path: Path, what: str) -> Any:
     # Text that is no UTF-8 and numbers of thousands of digits are ValueErrors too.
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a readable {what} ({error})") from None
+
+
+def read_toml(path: Path, missing: str) -> dict[str, Any]:
+    """Read a TOML file that a user wrote.
+
+    Args:
+        path: the file.
+        missing: what to say where there is none, such as `"no such plan"`.
+
+    Raises:
+        UserError: the file is missing, unreadable or not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(f"{path}: {missing}") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UserError(f"{path}: not a readable TOML file ({error})") from None
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from graspq.common.errors import UserError
 from graspq.common.files import write_text
 
 
@@ -51,6 +52,28 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def write_jsonl(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write rows as JSON, one a line, atomically."""
     write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+
+
+def read_jsonl(path: Path, columns: Iterable[str], command: str, what: str) -> list[dict[str, Any]]:
+    """Return the rows of a table that `write_jsonl` wrote.
+
+    Args:
+        path: the file.
+        columns: what every row must have.
+        command: that writes it, for the message.
+        what: what the file should be, for the message, such as `"the table of a sweep"`.
+
+    Raises:
+        UserError: the file is missing or unreadable, or a row lacks a column.
+    """
+    try:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        lacking = next((name for row in rows for name in columns if name not in row), None)
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: not a readable table of {command} ({error}); run {command} again") from None
+    if lacking is not None:
+        raise UserError(f"{path}: not {what} ({lacking!r} is missing); run {command} again")
+    return rows
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:

@@ -5,13 +5,13 @@ A job is one policy, task, split, object set, seed and number of episodes; a fil
 
 import glob
 import itertools
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
+from graspq.common.files import read_toml
 from graspq.evaluate.records import ORACLE, RANDOM
 from graspq.evaluate.settings import EvalSettings
 from graspq.train.search_settings import CemSettings
@@ -78,12 +78,7 @@ def read_jobs(path: Path, settings: EvalSettings) -> list[Job]:
     Raises:
         UserError: the file cannot be read, or a key or a value in it is none of these.
     """
-    try:
-        content = tomllib.loads(path.read_text())
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such jobs file") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"{path}: not a readable TOML file ({error})") from None
+    content = read_toml(path, "no such jobs file")
     tables = content.pop("jobs", [{}])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise UserError(f"{path}: jobs is no list of tables; write each as [[jobs]]")

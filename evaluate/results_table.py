@@ -4,7 +4,6 @@ A row names data, recipe and code by their digests, and holds the outcome of eve
 which task, object set, split and seed determine: whoever has the file can compute any test again.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graspq.common.errors import UserError
-from graspq.common.text import write_csv, write_jsonl
+from graspq.common.text import read_jsonl, write_csv, write_jsonl
 from graspq.evaluate.records import Evaluation
 
 RESULTS_FILE = "results.jsonl"
@@ -85,11 +84,4 @@ def read_results(path: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: it is not a table of grasp-eval, or lacks a column.
     """
-    try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        lacking = next((name for row in rows for name in COLUMNS if name not in row), None)
-    except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"{path}: not a readable table of grasp-eval ({error}); run grasp-eval again") from None
-    if lacking is not None:
-        raise UserError(f"{path}: not a table of grasp-eval of today ({lacking!r} is missing); run grasp-eval again")
-    return rows
+    return read_jsonl(path, COLUMNS, "grasp-eval", "a table of grasp-eval of today")

@@ -3,13 +3,11 @@
 `grasp-sweep` writes it as `sweep.jsonl` and `sweep.csv`; reports read it.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
-from graspq.common.text import write_csv, write_jsonl
+from graspq.common.text import read_jsonl, write_csv, write_jsonl
 
 SWEEP_FILE = "sweep.jsonl"
 NEEDED = ("id", "algo", "status", "steps", "success_rate")
@@ -27,11 +25,4 @@ def read_sweep_table(path: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: it is not the table of a sweep.
     """
-    try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        lacking = next((name for row in rows for name in NEEDED if name not in row), None)
-    except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"{path}: not a readable table of grasp-sweep ({error}); run grasp-sweep again") from None
-    if lacking is not None:
-        raise UserError(f"{path}: not the table of a sweep ({lacking!r} is missing); run grasp-sweep again")
-    return rows
+    return read_jsonl(path, NEEDED, "grasp-sweep", "the table of a sweep")

@@ -35,6 +35,11 @@ class Place:
     setting: str
     split: str
 
+    @classmethod
+    def of(cls, run: Mapping[str, Any]) -> "Place":
+        """Return the place of a line of the table of scores."""
+        return cls(run["task"], run["size"], run["setting"], run["split"])
+
     def __str__(self) -> str:
         return f"{self.task}, {self.size}, {self.setting}, {self.split}"
 
@@ -105,8 +110,7 @@ def asked_rows(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, Scor
     grouped: dict[Place, dict[str, list[Mapping[str, Any]]]] = {}
     for one in table:
         if one["kind"] == "run":
-            place = Place(one["task"], one["size"], one["setting"], one["split"])
-            grouped.setdefault(place, {}).setdefault(one["row"], []).append(one)
+            grouped.setdefault(Place.of(one), {}).setdefault(one["row"], []).append(one)
     found: dict[Place, dict[str, Scored]] = {}
     for place, here in grouped.items():
         for name, some in here.items():
@@ -162,9 +166,8 @@ def trainings(table: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, list[
     found: dict[Place, dict[str, list[tuple[str, float]]]] = {}
     for one in table:
         if one["kind"] == "run" and one["status"] in ("done", "failed"):
-            place = Place(one["task"], one["size"], one["setting"], one["split"])
             rate = float(one["success_rate"]) if one["status"] == "done" else 0.0
-            found.setdefault(place, {}).setdefault(one["algo"], []).append((one["row"], rate))
+            found.setdefault(Place.of(one), {}).setdefault(one["algo"], []).append((one["row"], rate))
     return found
 
 

@@ -1,13 +1,13 @@
 """The plan of a study: a TOML file that says which rows are trained on what, how often, and where they are scored."""
 
 import itertools
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
+from graspq.common.files import read_toml
 from graspq.common.options import parse_count
 from graspq.evaluate.jobs import checked_policy
 from graspq.studies.sweep.settings import SET_BY_SWEEP
@@ -113,12 +113,7 @@ def read_plan(path: Path) -> StudyPlan:
     Raises:
         UserError: the file cannot be read, or says something that is none of this.
     """
-    try:
-        content = tomllib.loads(path.read_text())
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such plan; studies/plans/ holds examples") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"{path}: not a readable TOML file ({error})") from None
+    content = read_toml(path, "no such plan; studies/plans/ holds examples")
     for key, value in content.items():
         kinds, _, expected = KEYS.get(key, ((), None, ""))
         if not kinds:

@@ -4,7 +4,7 @@ The file is made anew from the evaluations' own files each time, never added to.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from graspq.studies.study.cells import Cell
 from graspq.studies.study.freezing import key_of, read_recipe
 from graspq.studies.study.plan_file import StudyPlan
 from graspq.studies.sweep.trial import SCENES_SEED, run_in
-from graspq.train.run import Run
 
 SCORES_FILE = "study.jsonl"
 OF_AN_EVALUATION = (
@@ -59,15 +58,20 @@ def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
         row["discount"] = run.config.get("discount")
         row["data_sha256"] = run.config.get("dataset", {}).get("manifest_sha256")
         row["trained_by"] = run.config.get("code_revision")
-        validations = [one["validation"] for one in run.metrics() if "validation" in one]
-        row["fresh_grasps"] = fresh_grasps(run)
+        metrics = run.metrics()
+        validations = [one["validation"] for one in metrics if "validation" in one]
+        row["fresh_grasps"] = fresh_grasps(metrics)
         row["validation"] = validations[-1] if validations else None
     return row | (_score(state.evaluation) if state.evaluation is not None else {})
 
 
-def fresh_grasps(run: Run) -> int:
-    """Return how many grasps of its own policies a run has added to its data; 0 where it was trained off-policy."""
-    return max((one["online"]["grasps_so_far"] for one in run.metrics() if "online" in one), default=0)
+def fresh_grasps(metrics: Iterable[Mapping[str, Any]]) -> int:
+    """Return how many grasps of its own policies a run has added to its data; 0 where it was trained off-policy.
+
+    Args:
+        metrics: of the run, see `Run.metrics`.
+    """
+    return max((one["online"]["grasps_so_far"] for one in metrics if "online" in one), default=0)
 
 
 def _score(evaluation: Evaluation) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def test_rounds_collect_first_and_train_then_on_all_so_far(unbroken: Run) -> Non
     assert [row["step"] for row in rows] == [6, 12, 18]
     assert [row["online"]["round"] for row in rows] == [1, 2, 3]
     assert [row["online"]["grasps_so_far"] for row in rows] == [2, 4, 6]
-    assert fresh_grasps(unbroken) == 6
+    assert fresh_grasps(unbroken.metrics()) == 6
     assert [row["online"]["exploration"] for row in rows] == pytest.approx([0.715, 0.43, 0.145], abs=1e-9)
     assert unbroken.checkpoint().name == "step-00000024"
     losses = [row["step"] for row in unbroken.metrics() if "loss" in row]
