@@ -35,6 +35,7 @@ def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
         time.sleep(0.02)
     process.kill()
     process.wait()
+    time.sleep(5)  # its workers end by themselves, and hold the run until then
 
     assert grasp_study(*words, "--workers", "0") == 0
     table = [json.loads(line) for line in Path("study/study.jsonl").read_text().splitlines()]
