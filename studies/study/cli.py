@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from graspq.studies.study.cells import Cell
     from graspq.studies.study.plan_file import StudyPlan
+    from graspq.studies.study.scores import Published
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ class PublishSettings(PlanSettings):
     )
     results: Path = setting(Path("results"), help="Folder for scores and figures.")
     page: Path = setting(Path("RESULTS.md"), help="Page that gets a section on the study.")
+    keep_published: bool = setting(
+        False,
+        help="Keep what --results holds of this very recipe and these data, and do not do it again: a study goes on in "
+        "another clone, or on another machine.",
+    )
 
 
 @dataclass(frozen=True)
@@ -84,8 +90,9 @@ def run(settings: RunSettings) -> int:
     if settings.dry_run:
         click.echo(plan_text(settings.folder, cells))
         return 0
-    status = run_study(plan, settings.folder, cells, retry_failed=settings.retry_failed)
-    if status != INTERRUPTED and any(cell.state().status == "done" for cell in cells):
+    published = _published(settings, plan, cells)
+    status = run_study(plan, settings.folder, cells, retry_failed=settings.retry_failed, published=published)
+    if status != INTERRUPTED and any(cell.name in published or cell.state().status == "done" for cell in cells):
         _publish(settings)
     return status
 
@@ -123,12 +130,23 @@ def _publish(settings: PublishSettings) -> None:
     from graspq.studies.study.scores import read_scores, write_scores
 
     plan, cells = _plan(settings)
-    kept = settings.results / f"study-{plan.name}.jsonl"
+    published = _published(settings, plan, cells)
     here = settings.folder.is_dir()
-    table = write_scores(plan, settings.folder, cells) if here else read_scores([kept])
+    table = write_scores(plan, settings.folder, cells, published) if here else read_scores([scores_of(settings, plan)])
     beside, reference = read_scores(settings.beside), plan.values["reference"]
     written = publish(plan.name, plan.path, table, beside, settings.results, settings.page, reference)
     click.echo(f"wrote {', '.join(path.as_posix() for path in written)}")
+
+
+def scores_of(settings: PublishSettings, plan: "StudyPlan") -> Path:
+    """Return the file in which a plan's scores are published."""
+    return settings.results / f"study-{plan.name}.jsonl"
+
+
+def _published(settings: PublishSettings, plan: "StudyPlan", cells: "Sequence[Cell]") -> "Published":
+    from graspq.studies.study.scores import NOTHING, published_runs
+
+    return published_runs(plan, cells, scores_of(settings, plan)) if settings.keep_published else NOTHING
 
 
 def _plan(settings: PlanSettings, workers: int | None = None, device: str = "auto") -> "tuple[StudyPlan, list[Cell]]":

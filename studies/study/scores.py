@@ -6,10 +6,12 @@ The file is made anew from the evaluations' own files each time, never added to.
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from graspq.common.errors import UserError
 from graspq.common.text import write_jsonl
+from graspq.datasets.manifest import MANIFEST_NAME, Manifest
 from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
 from graspq.evaluate.results_table import scored
 from graspq.studies.study.cells import Cell
@@ -24,19 +26,64 @@ OF_AN_EVALUATION = (
 )  # fmt: skip
 KINDS = ("scenes", "reference", "run")
 
+Published = Mapping[str, dict[str, Any]]
+"""Lines of runs that were scored elsewhere, by the names of their cells."""
+NOTHING: Published = MappingProxyType({})
 
-def write_scores(plan: StudyPlan, folder: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
+
+def write_scores(
+    plan: StudyPlan, folder: Path, cells: Sequence[Cell], published: Published = NOTHING
+) -> list[dict[str, Any]]:
     """Write the scores of a study; return them.
 
     A line is of a `kind`: `run`, see `run_row`; `reference`, a policy without a run; `scenes`, the objects that lay in
     each scene, in the order of the outcomes.
+
+    Args:
+        plan: the plan.
+        folder: of the study.
+        cells: its cells.
+        published: lines that stand for cells whose runs are elsewhere, see `published_runs`.
     """
     frozen = read_recipe(plan.recipe)["rows"] if plan.recipe.exists() else {}
-    runs = [run_row(plan, cell, frozen.get(key_of(cell), {}).get("digest") == cell.digest) for cell in cells]
+    runs = [
+        published.get(cell.name) or run_row(plan, cell, frozen.get(key_of(cell), {}).get("digest") == cell.digest)
+        for cell in cells
+    ]
     references = list(_references(plan, folder))
     rows = [*_scenes(plan, folder, cells), *references, *runs]
     write_jsonl(folder / SCORES_FILE, rows)
     return rows
+
+
+def published_runs(plan: StudyPlan, cells: Sequence[Cell], path: Path) -> Published:
+    """Return the lines of published scores that are runs of the plan's cells, which need not be done again then.
+
+    Only what was trained by the very recipe, and scored on as many scenes of the same split, counts; not what failed.
+
+    Args:
+        plan: the plan.
+        cells: its cells.
+        path: scores as `write_scores` writes them; none where the file is not there.
+
+    Raises:
+        UserError: it is no such file, or a line is of other data than those that lie here.
+    """
+    here = {(cell.row, cell.task, cell.size, cell.seed): cell for cell in cells}
+    asked = {"split": plan.split, "setting": plan.values["setting"], "episodes": plan.values["episodes"]}
+    found = {}
+    for line in read_scores([path]) if path.exists() else []:
+        if line["kind"] != "run" or line["status"] != "done":
+            continue
+        cell = here.get((line["row"], line["task"], line["size"], line["seed"]))
+        wanted = asked | {"recipe_sha256": cell.digest if cell is not None else None}
+        if cell is None or any(line.get(name) != value for name, value in wanted.items()):
+            continue
+        data = plan.dataset(cell.task, cell.size)
+        if (data / MANIFEST_NAME).is_file() and Manifest.load(data).digest() != line["data_sha256"]:
+            raise UserError(f"{path}: {cell.name} was trained on other data than {data}; give another --results")
+        found[cell.name] = line
+    return found
 
 
 def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:

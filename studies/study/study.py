@@ -19,7 +19,7 @@ from graspq.evaluate.recipe_digest import of_a_recipe
 from graspq.studies.study.cells import Cell, by_dataset
 from graspq.studies.study.freezing import difference, require_frozen
 from graspq.studies.study.plan_file import StudyPlan
-from graspq.studies.study.scores import reference, write_scores
+from graspq.studies.study.scores import NOTHING, Published, reference, write_scores
 from graspq.studies.sweep.checks import check_commands, check_data, objects_beside
 from graspq.studies.sweep.commands import CommandLine
 from graspq.studies.sweep.table import line_of
@@ -62,8 +62,22 @@ class Called:
             raise UserError(f"{self.name}: {last or f'{self.command.script} ended with status {status}'} ({self.log})")
 
 
-def run_study(plan: StudyPlan, folder: Path, cells: Sequence[Cell], *, retry_failed: bool = False) -> int:
+def run_study(
+    plan: StudyPlan,
+    folder: Path,
+    cells: Sequence[Cell],
+    *,
+    retry_failed: bool = False,
+    published: Published = NOTHING,
+) -> int:
     """Do what a plan asks for; return the exit status: 0, 1 if a cell failed, 130 if a signal stopped it.
+
+    Args:
+        plan: the plan.
+        folder: of the study.
+        cells: its cells.
+        retry_failed: train again what failed.
+        published: scores that stand for cells, which are not done again; see `published_runs`.
 
     Raises:
         UserError: the plan cannot be carried out as it stands; no training was started then.
@@ -71,7 +85,8 @@ def run_study(plan: StudyPlan, folder: Path, cells: Sequence[Cell], *, retry_fai
     require_frozen(plan, cells)
     check_runs(cells)
     wanted = ("to do", "failed") if retry_failed else ("to do",)
-    todo = [cell for cell in cells if cell.state().status in wanted]
+    here = [cell for cell in cells if cell.name not in published]
+    todo = [cell for cell in here if cell.state().status in wanted]
     check_commands(todo)
     writable_folder(folder, "study")
     with locked(folder, "grasp-study"):
@@ -79,27 +94,28 @@ def run_study(plan: StudyPlan, folder: Path, cells: Sequence[Cell], *, retry_fai
         for cell in todo:
             cell.failure_note.unlink(missing_ok=True)
         finished = len(cells) - len(todo)
-        click.echo(f"{folder}: {finished} of {len(cells)} trainings finished before", err=True)
+        elsewhere = f", {len(published)} of them published" if published else ""
+        click.echo(f"{folder}: {finished} of {len(cells)} trainings finished before{elsewhere}", err=True)
 
         def report(ending: Ending[Cell]) -> None:
             nonlocal finished
             if not ending.skipped:
                 finished += 1
                 click.echo(f"[{finished}/{len(cells)}] {line_of(ending.unit.state())}", err=True)
-                write_scores(plan, folder, cells)
+                write_scores(plan, folder, cells, published)
 
         try:
             carry_out(collections(plan, cells), lambda ending: None, keep_going=False)
             for some in by_dataset(todo).values():
                 check_data(some[0].settings, some)
             carry_out(references(plan, cells), lambda ending: None, keep_going=False)
-            write_scores(plan, folder, cells)
-            carry_out(cells, report, hand_out=hand_out)
+            write_scores(plan, folder, cells, published)
+            carry_out(here, report, hand_out=hand_out)
         except KeyboardInterrupt:
             click.echo(f"interrupted; the same command goes on with {folder}", err=True)
             return INTERRUPTED
-        write_scores(plan, folder, cells)
-    return int(any(cell.state().status != "done" for cell in cells))
+        write_scores(plan, folder, cells, published)
+    return int(any(cell.state().status != "done" for cell in here))
 
 
 def collections(plan: StudyPlan, cells: Sequence[Cell]) -> Iterator[Called]:

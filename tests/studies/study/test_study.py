@@ -72,6 +72,39 @@ def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
     assert "batch_size = 4 now, 8 when it was trained" in capfd.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_study_goes_on_in_another_clone_from_what_was_published(
+    plan: Callable[..., Any], data: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    one = ('rows = ["mc", {algo = "dql", width = [4, 5]}]', 'rows = ["mc"]')
+    words = ["run", "tiny.toml", "--device", "cpu", "--workers", "0", "--keep-published"]
+    plan(one, ("seeds = 2", "seeds = 1"), data=data)
+    assert grasp_study(*words, "--out", "first") == 0
+    published = Path("results/study-tiny.jsonl")
+    lines = [json.loads(line) for line in published.read_text().splitlines()]
+    assert [line["kind"] for line in lines] == ["scenes", "reference", "run"]
+    marked = published.read_text().replace('"trained_by"', '"marked": 1, "trained_by"')
+    published.write_text(marked)
+
+    plan(one, data=data)
+    assert grasp_study(*words, "--out", "second") == 0
+    assert "1 of 2 trainings finished before, 1 of them published" in capfd.readouterr().err
+    assert [path.name for path in Path("second/runs").iterdir()] == ["mc-regular-12-seed1"]
+    rows = [json.loads(line) for line in published.read_text().splitlines()][2:]
+    assert [(row["seed"], row["status"], "marked" in row) for row in rows] == [(0, "done", True), (1, "done", False)]
+    assert "2 of 2 trainings" in Path("RESULTS.md").read_text()
+
+    # Another recipe is not the published one; other data of the same name are refused before anything is done.
+    plan(one, ("batch_size = 8", "batch_size = 4"), data=data)
+    assert grasp_study(*words, "--out", "third", "--dry-run") == 0
+    assert grasp_study(*words, "--out", "third") == 0
+    assert "0 of 2 trainings finished before" in capfd.readouterr().err
+    published.write_text(marked.replace(lines[2]["data_sha256"], "0" * 64))
+    plan(one, data=data)
+    assert grasp_study(*words, "--out", "fourth") == 2
+    assert "trained on other data" in capfd.readouterr().err and not Path("fourth").exists()
+
+
 def test_a_mistake_is_one_line_before_anything_is_collected_or_trained(
     plan: Callable[..., Any], capfd: pytest.CaptureFixture[str]
 ) -> None:
