@@ -7,6 +7,7 @@ TORCH_INDEX ?=
 TEST_WORKERS ?= 2
 BENCH ?=
 PLAN ?= studies/plans/10k.toml
+FAULTS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -16,7 +17,7 @@ QUICK := runs/quickstart
 QUICK_STEPS := 700
 export PYTHONUNBUFFERED := 1
 
-.PHONY: help setup quickstart test python-versions lint types data bench study clean
+.PHONY: help setup quickstart test faults python-versions lint types data bench study clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 17
@@ -59,6 +60,9 @@ study: setup ## train, score and judge every row of PLAN=studies/plans/10k.toml 
 
 test: setup lint types ## everything that CI checks (at most 10 minutes)
 	$(BIN)/python -P -m pytest -n $(TEST_WORKERS) --dist loadfile
+
+faults: setup ## break every command in every way that is listed: results/faults.json and the table in RESULTS.md [FAULTS='--kind crash'] (goes on where it was stopped)
+	$(BIN)/python -P tests/faults $(FAULTS)
 
 python-versions: setup ## whether newer Pythons at hand collect the same bytes (3.12, 3.13; skips those that are not there)
 	@bash .ci/python_versions.sh

@@ -1,0 +1,66 @@
+"""`make faults`: breaks the real commands in every way that is listed, and says what became of them.
+
+Goes on where it was stopped. Ends with results/faults.json and the table in RESULTS.md.
+"""
+
+import argparse
+import sys
+import time
+import types
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+# The root must not be on the path, where `datasets/` would hide another library; `tests` is found without.
+sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() not in (ROOT, ROOT / "tests" / "faults")]
+if not hasattr(sys.modules.get("tests"), "__file__"):
+    tests = types.ModuleType("tests")
+    tests.__path__ = [str(ROOT / "tests")]
+    sys.modules["tests"] = tests
+
+from graspq.common.files import write_json, write_text  # noqa: E402
+from tests.faults.harness import GOOD, Log, Work, code_digest, rows_of, table, try_kind  # noqa: E402
+from tests.faults.kinds import KINDS  # noqa: E402
+
+START, END = "<!-- made by tests/faults -->", "<!-- end of faults -->"
+
+
+def main() -> int:
+    """Try what was not tried yet; return 1 where a fault was lost, silently wrong, hung or a traceback."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
+    parser.add_argument("--kind", action="append", help="only kinds whose name holds this; may be repeated")
+    parser.add_argument("--short", action="store_true", help="the few that `make test` tries; publishes nothing")
+    parser.add_argument("--limit-minutes", type=float, default=float("inf"), help="stop after so long")
+    given = parser.parse_args()
+    until = time.monotonic() + 60 * given.limit_minutes
+    folder = ROOT / "runs" / "faults"
+    log, found = Log(folder / "tried.jsonl"), []
+    with Work(folder / code_digest()) as work:
+        for kind in KINDS:
+            code = code_digest(Path(sys.modules[type(kind).__module__].__file__ or ""))
+            if given.kind is None or any(name in kind.name for name in given.kind):
+                found += try_kind(kind, work, log, code, given.short, until)
+            else:
+                found += [
+                    (fault, log.tried[fault][1])
+                    for fault in log.tried
+                    if fault.kind == kind.name and log.knows(fault, code)
+                ]
+    rows = rows_of(found)
+    text = table(rows)
+    print(text)
+    if not given.short:
+        publish(rows, text)
+    return int(any(one.outcome not in GOOD for _, one in found))
+
+
+def publish(rows: list[dict[str, object]], text: str) -> None:
+    """Write results/faults.json, and the table between its marks in RESULTS.md."""
+    write_json(ROOT / "results" / "faults.json", rows)
+    page = ROOT / "RESULTS.md"
+    before, _, rest = page.read_text().partition(START)
+    _, _, after = rest.partition(END)
+    write_text(page, f"{before}{START}\n\n{text}\n{END}{after}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

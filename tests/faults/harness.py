@@ -1,0 +1,430 @@
+"""What all faults share: small real work to damage, commands that are run on it, and one table of what became of them.
+
+A kind of fault is a class with a name, a list of its faults and a way to try one; `KINDS` in `__main__` has them all.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+from graspq.common.text import markdown
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent.parent
+Outcome = Literal["survived", "detected", "lost", "silently wrong", "hung", "traceback"]
+OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+GOOD: tuple[Outcome, ...] = ("survived", "detected")
+SECONDS = 300.0  # a command that takes longer hangs; machines that others share are slow
+TRACEBACK = "Traceback (most recent call last)"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault, replayable by its name alone.
+
+    Attributes:
+        kind: name of its kind, a row group of the table.
+        command: the command that meets it, a row of the table.
+        name: unique within kind and command.
+    """
+
+    kind: str
+    command: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What became of a fault, and the line that the command said or what was found."""
+
+    outcome: Outcome
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class Ran:
+    """How a command ended; `rc` is minus the signal's number where one ended it."""
+
+    rc: int
+    stdout: str
+    stderr: str
+    seconds: float
+    hung: bool
+
+    @property
+    def traceback(self) -> bool:
+        """Whether it showed a traceback."""
+        return TRACEBACK in self.stderr or TRACEBACK in self.stdout
+
+    @property
+    def line(self) -> str:
+        """The last line that it said on standard error."""
+        return next((line.strip() for line in reversed(self.stderr.splitlines()) if line.strip()), "")
+
+    def broken(self) -> Tried | None:
+        """Return what is wrong whatever was expected: it hung, showed a traceback, or a signal ended it."""
+        if self.hung:
+            return Tried("hung", self.line)
+        if self.traceback:
+            return Tried("traceback", self.line)
+        if self.rc < 0 and self.rc != -signal.SIGKILL:
+            return Tried("traceback", f"ended by {signal.Signals(-self.rc).name}: {self.line}")
+        return None
+
+    def refused(self, *named: str) -> Tried:
+        """Judge a command that had to refuse: one line, which names one of `named` where any are given."""
+        broken = self.broken()
+        if broken is not None:
+            return broken
+        if self.rc == 0:
+            return Tried("silently wrong", f"exit status 0: {self.line}")
+        if named and not any(name in self.stderr for name in named):
+            return Tried("silently wrong", f"names none of {', '.join(named)}: {self.line}")
+        return Tried("detected", self.line)
+
+
+class Kind(Protocol):
+    """A kind of fault."""
+
+    name: str
+
+    def faults(self, work: "Work", short: bool) -> Iterable[Fault]:
+        """Return all faults, or a few of each command for `make test`."""
+
+    def tried(self, fault: Fault, work: "Work") -> Tried:
+        """Try one; whatever it leaves in a copy of the work is thrown away."""
+
+
+# Name -> path of an input below the folder of the work, and the commands that make it, run there.
+PLAN = """rows = ["mc"]
+sizes = ["24"]
+seeds = 1
+preset = "paper"
+steps = 4
+episodes = 2
+data = "data"
+recipe = "recipe.json"
+policies = ["random"]
+threads = 1
+options = {width = 4, batch_size = 8, save_every = 2}
+"""
+TRAINING = (
+    "--preset paper --width 4 --batch-size 8 --validation-fraction 0.3 --save-every 2 --device cpu --precision float32 "
+    "--threads 1"
+)
+MADE: dict[str, tuple[str, tuple[str, ...]]] = {
+    "objects": ("objects", ("grasp-objects make procedural objects --train 6 --test 6 --validation 6",)),
+    "dataset": ("data/regular-24", (f"{HERE / 'small_dataset.py'} 24 data/regular-24 objects",)),
+    "run": ("runs/mc", (f"grasp-train --algo mc --shards data/regular-24 --out runs/mc --steps 8 {TRAINING}",)),
+    "evaluation": (
+        "scores",
+        ("grasp-eval runs/mc --episodes 4 --films 1 --workers 0 --device cpu --out scores",),
+    ),
+    "sweep": (
+        "sweep",
+        (
+            "grasp-sweep --algo mc --shards data/regular-24 --learning-rate 0.001 --width 4 --seeds 1 --steps 4 "
+            "--episodes 2 --vary batch_size=8 --threads 1 --workers 0 --device cpu --out sweep",
+        ),
+    ),
+    "study": (
+        "study",
+        (
+            "grasp-study freeze plan.toml --out study",
+            "grasp-study run plan.toml --out study --workers 0 --device cpu --results results --page page.md",
+        ),
+    ),
+    "online": (
+        "runs/online",
+        (
+            "grasp-online --start runs/mc --rounds 2 --grasps 2 --steps-per-round 3 --save-every 2 --workers 0 "
+            "--out runs/online",
+        ),
+    ),
+}
+BESIDE = ("plan.toml", "recipe.json", "results", "page.md")  # of the study
+
+
+class Work:
+    """A folder of small real inputs, each made once by the real commands, and processes that work on copies of them.
+
+    Attributes:
+        folder: everything is below it.
+        inputs: the inputs; read only.
+        source: a copy of the source tree whose code runs in the place of this one's; see `planted`.
+    """
+
+    def __init__(self, folder: Path, source: Path | None = None, shim: Path | None = None) -> None:
+        self.folder, self.inputs, self.source = folder.absolute(), folder.absolute() / "inputs", source
+        self._shim = shim
+        self._template: subprocess.Popen[str] | None = None
+        self._cases = 0
+        self.inputs.mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> "Work":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._template is not None:
+            assert self._template.stdin is not None
+            self._template.stdin.close()
+            self._template.wait()
+            self._template = None
+        shutil.rmtree(self.folder / "cases", ignore_errors=True)
+
+    def made(self, name: str) -> Path:
+        """Return an input, made with all that it needs if it is not there yet; to read only."""
+        note = self.inputs / f".{name}-made"
+        order = list(MADE)
+        if not note.exists():
+            needs = {"dataset": ["objects"], "run": ["dataset"], "evaluation": ["run"], "online": ["run"]}
+            for other in needs.get(name, order[:2] if name in ("sweep", "study") else []):
+                self.made(other)
+            if name == "study":
+                (self.inputs / "plan.toml").write_text(PLAN)
+            for command in MADE[name][1]:
+                ran = self.forked(command.split(), self.inputs)
+                if ran.rc != 0:
+                    raise RuntimeError(f"{command}: {ran.rc}\n{ran.stderr}")
+            note.touch()
+        return self.inputs / MADE[name][0]
+
+    objects = property(lambda self: self.made("objects"))
+    dataset = property(lambda self: self.made("dataset"))
+    run_folder = property(lambda self: self.made("run"))
+    evaluation = property(lambda self: self.made("evaluation"))
+    sweep = property(lambda self: self.made("sweep"))
+    study = property(lambda self: self.made("study"))
+    online = property(lambda self: self.made("online"))
+
+    @contextlib.contextmanager
+    def copy(self, *names: str) -> Iterator[Path]:
+        """Yield a fresh folder to damage, with copies of inputs at the places that they have in `inputs`.
+
+        It is the working folder for commands, and is removed afterwards.
+        """
+        self._cases += 1
+        case = self.folder / "cases" / f"{os.getpid()}-{self._cases}"
+        case.mkdir(parents=True)
+        try:
+            for name in names:
+                made = self.made(name)
+                shutil.copytree(made, case / MADE[name][0], symlinks=True)
+                for beside in BESIDE if name == "study" else ():
+                    there = self.inputs / beside
+                    if there.is_dir():
+                        shutil.copytree(there, case / beside)
+                    elif there.exists():
+                        shutil.copy2(there, case / beside)
+            yield case
+        finally:
+            shutil.rmtree(case, ignore_errors=True)
+
+    def run(
+        self,
+        argv: Sequence[str | Path],
+        cwd: Path,
+        *,
+        env: Mapping[str, str] | None = None,
+        before: Sequence[str] = (),
+        seconds: float = SECONDS,
+        preexec: Callable[[], None] | None = None,
+    ) -> Ran:
+        """Run a command (`grasp-train ...`, or a script) as a user does, in a process that is started anew.
+
+        Args:
+            argv: its words.
+            cwd: working folder.
+            env: variables to change.
+            before: words that stand before the command, such as `strace ...`.
+            seconds: it, and all that it has started, is killed after so long, and has hung.
+            preexec: called in the process before the command begins.
+        """
+        program, *arguments = map(str, argv)
+        script = Path(sys.executable).with_name(program)
+        words = [str(script)] if script.exists() else [sys.executable, "-P", program]
+        start = time.monotonic()
+        with subprocess.Popen(
+            [*before, *words, *arguments],
+            cwd=cwd,
+            env=self.environment(env),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+            preexec_fn=preexec,
+        ) as process:
+            try:
+                out, err = process.communicate(timeout=seconds)
+                hung = False
+            except subprocess.TimeoutExpired:
+                hung = True
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            if hung:
+                out, err = process.communicate()
+        return Ran(
+            process.returncode, out.decode(errors="replace"), err.decode(errors="replace"),
+            time.monotonic() - start, hung,
+        )  # fmt: skip
+
+    def forked(
+        self,
+        argv: Sequence[str | Path],
+        cwd: Path,
+        *,
+        env: Mapping[str, str] | None = None,
+        seconds: float = SECONDS,
+        limits: Mapping[str, int] | None = None,
+        armed: Mapping[str, Any] | None = None,
+        stdin: str = os.devnull,
+    ) -> Ran:
+        """Run a command in a child, forked for it alone, of a process that has imported all commands: see `template`.
+
+        Args:
+            argv: its words.
+            cwd: working folder.
+            env: variables to change.
+            seconds: see `run`.
+            limits: `RLIMIT_...` -> soft and hard limit.
+            armed: what `shim.c` does to its system calls.
+            stdin: path of its standard input.
+        """
+        template = self._started()
+        assert template.stdin is not None and template.stdout is not None
+        said = self.folder / "said"
+        said.mkdir(exist_ok=True)
+        request = {
+            "argv": [str(word) for word in argv], "cwd": str(cwd), "env": self.environment(env), "stdin": stdin,
+            "stdout": str(said / "out"), "stderr": str(said / "err"), "seconds": seconds, "limits": dict(limits or {}),
+            "armed": None if armed is None else dict(armed),
+        }  # fmt: skip
+        print(json.dumps(request), file=template.stdin, flush=True)
+        answer = json.loads(template.stdout.readline())
+        out, err = ((said / name).read_text(errors="replace") for name in ("out", "err"))
+        return Ran(stdout=out, stderr=err, **answer)
+
+    def environment(self, changed: Mapping[str, str] | None = None) -> dict[str, str]:
+        """Return the variables of a command: one thread, a temporary folder of the harness, the code of `source`."""
+        temporary = self.folder / "temporary"
+        temporary.mkdir(exist_ok=True)
+        fixed = {"OMP_NUM_THREADS": "1", "TMPDIR": str(temporary), "PYTHONUNBUFFERED": "1"}
+        if self.source is not None:
+            fixed["PYTHONPATH"] = str(self.source)
+        return {**os.environ, **fixed, **(changed or {})}
+
+    def _started(self) -> "subprocess.Popen[str]":
+        if self._template is None or self._template.poll() is not None:
+            shim = {} if self._shim is None else {"LD_PRELOAD": str(self._shim)}
+            self._template = subprocess.Popen(
+                [sys.executable, HERE / "template.py"],
+                env=self.environment(shim),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            assert self._template.stdout is not None
+            if self._template.stdout.readline() != "ready\n":
+                raise RuntimeError("the template process did not start")
+        return self._template
+
+
+def digest_of(folder: Path, but: Sequence[str] = ()) -> dict[str, str]:
+    """Return path -> SHA-256 of all files of a folder, but for names in `but`; folders and links count as such."""
+    found: dict[str, str] = {}
+    for path in sorted(folder.rglob("*")):
+        if not any(part in but for part in path.relative_to(folder).parts):
+            name = str(path.relative_to(folder))
+            if path.is_symlink():
+                found[name] = f"link to {path.readlink()}"
+            else:
+                found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+    return found
+
+
+def code_digest(*files: Path) -> str:
+    """Return one SHA-256 of the product's code, of the harness and of the files of a kind."""
+    packages = [path.parent for path in ROOT.glob("*/__init__.py") if path.parent.name != "tests"]
+    product = [path for folder in packages for path in folder.rglob("*") if path.suffix in (".py", ".html")]
+    shared = [HERE / name for name in ("harness.py", "template.py", "small_dataset.py")]
+    whole = hashlib.sha256()
+    for path in sorted({*product, *shared, *files}):
+        whole.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes() + b"\0")
+    return whole.hexdigest()[:16]
+
+
+@dataclass
+class Log:
+    """All faults that were tried, one line of JSON each; one that was tried with other code counts as not tried."""
+
+    path: Path
+    tried: dict[Fault, tuple[str, Tried]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Read what is there; a line that a kill cut short is left out."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        lines = self.path.read_text().split("\n")[:-1] if self.path.exists() else []
+        for line in lines:
+            values = json.loads(line)
+            fault = Fault(values["kind"], values["command"], values["name"])
+            self.tried[fault] = values["code"], Tried(values["outcome"], values["said"])
+        if self.path.exists():
+            self.path.write_text("".join(f"{line}\n" for line in lines))
+
+    def knows(self, fault: Fault, code: str) -> bool:
+        """Return whether it was tried with this code."""
+        return fault in self.tried and self.tried[fault][0] == code
+
+    def add(self, fault: Fault, code: str, tried: Tried, seconds: float) -> None:
+        """Append one."""
+        self.tried[fault] = code, tried
+        values = {"kind": fault.kind, "command": fault.command, "name": fault.name, "code": code}
+        values |= {"outcome": tried.outcome, "said": tried.said, "seconds": round(seconds, 2)}
+        with self.path.open("a") as file:
+            file.write(json.dumps(values) + "\n")
+
+
+def try_kind(kind: Kind, work: Work, log: Log, code: str, short: bool, until: float) -> list[tuple[Fault, Tried]]:
+    """Try the faults of a kind that were not tried yet, until the clock (`time.monotonic`) says `until`."""
+    found = []
+    for fault in kind.faults(work, short):
+        if time.monotonic() > until:
+            break
+        if not log.knows(fault, code):
+            start = time.monotonic()
+            tried = kind.tried(fault, work)
+            log.add(fault, code, tried, time.monotonic() - start)
+            if tried.outcome not in GOOD:
+                print(f"{fault.kind}, {fault.command}, {fault.name}: {tried.outcome}: {tried.said}", file=sys.stderr)
+        found.append((fault, log.tried[fault][1]))
+    return found
+
+
+def rows_of(tried: Iterable[tuple[Fault, Tried]]) -> list[dict[str, Any]]:
+    """Return a row a kind and command: how often it was tried, and what became of it."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for fault, one in tried:
+        empty = {"fault": fault.kind, "command": fault.command, "tried": 0} | dict.fromkeys(OUTCOMES, 0)
+        row = rows.setdefault((fault.kind, fault.command), empty)
+        row["tried"] += 1
+        row[one.outcome] += 1
+    return list(rows.values())
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the rows and their sum as a Markdown table."""
+    columns = ("fault", "command", "tried", *OUTCOMES)
+    kinds = len({row["fault"] for row in rows})
+    total = [f"all ({kinds} kinds)", "", *(sum(row[name] for row in rows) for name in columns[2:])]
+    lines = [*([row[name] for name in columns] for row in rows), total]
+    return markdown(columns, [[str(cell) for cell in line] for line in lines])

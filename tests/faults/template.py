@@ -1,0 +1,111 @@
+"""A process that has imported every command and forks one for each request: a fault does not pay for Python's start.
+
+Requests and answers are lines of JSON on the standard input and output that it is started with; see `Request`.
+"""
+
+import contextlib
+import ctypes
+import importlib
+import json
+import os
+import resource
+import runpy
+import select
+import signal
+import sys
+import tempfile
+import time
+from typing import Any, NoReturn
+
+COMMANDS = {
+    "grasp-objects": "graspq.objects.cli",
+    "grasp-datagen": "graspq.datagen.cli",
+    "grasp-data": "graspq.datasets.cli",
+    "grasp-train": "graspq.train.cli",
+    "grasp-online": "graspq.studies.online.cli",
+    "grasp-eval": "graspq.evaluate.cli",
+    "grasp-sweep": "graspq.studies.sweep.cli",
+    "grasp-study": "graspq.studies.study.cli",
+    "grasp-report": "graspq.report.cli",
+}
+# What the commands import late.
+LATE = (
+    "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop", "graspq.evaluate.evaluation",
+    "graspq.policies.of_run", "graspq.studies.online.rounds", "graspq.studies.sweep.workers",
+    "graspq.studies.sweep.table", "graspq.studies.study.study", "graspq.studies.study.publishing",
+    "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
+)  # fmt: skip
+Request = dict[str, Any]  # argv, cwd, env, stdin, stdout, stderr (paths), seconds, limits (name -> bytes), armed
+
+
+def main() -> None:
+    """Answer requests until there are no more."""
+    sys.path.pop(0)  # this folder: names of ours must hide nobody's
+    requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
+    nothing = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nothing, 0)
+    os.dup2(nothing, 1)
+    for name in (*COMMANDS.values(), *LATE):
+        importlib.import_module(name)
+    importlib.import_module("graspq.common.provenance").code_revision()
+    print("ready", file=answers, flush=True)
+    for line in requests:
+        print(json.dumps(_answer(json.loads(line))), file=answers, flush=True)
+
+
+def _answer(request: Request) -> dict[str, Any]:
+    start = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        _be(request)
+    ended = os.pidfd_open(child)
+    with contextlib.closing(os.fdopen(ended)):
+        hung = not select.select([ended], [], [], request["seconds"])[0]
+    # The child leads a group of its own: what it has started ends with it.
+    if hung:
+        _kill_group(child)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    _kill_group(child)
+    return {"rc": status, "hung": hung, "seconds": time.monotonic() - start}
+
+
+def _kill_group(leader: int) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(leader, signal.SIGKILL)
+
+
+def _be(request: Request) -> NoReturn:
+    """Become the process of a command; it ends as the command would."""
+    os.setsid()
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["env"])
+    tempfile.tempdir = None
+    for number, name, flags in (
+        (0, "stdin", os.O_RDONLY),
+        (1, "stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC),
+        (2, "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC),
+    ):
+        opened = os.open(request[name], flags, 0o644)
+        os.dup2(opened, number)
+        os.close(opened)
+    program, *arguments = sys.argv = list(request["argv"])
+    for name, limit in request["limits"].items():
+        resource.setrlimit(getattr(resource, name), (limit, limit))
+    if request["armed"] is not None:
+        _arm(**request["armed"])
+    if program in COMMANDS:
+        sys.exit(importlib.import_module(COMMANDS[program]).main(arguments, prog_name=program))
+    runpy.run_path(program, run_name="__main__")
+    sys.exit(0)
+
+
+def _arm(under: str, mode: int, at: int, error: int, log: str, calls: int) -> None:
+    """Arm `shim.c`, which this process was started with."""
+    arm = ctypes.CDLL(None).graspq_arm
+    arm.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_long, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint]
+    arm(under.encode(), mode, at, error, log.encode(), calls)
+
+
+if __name__ == "__main__":
+    main()
