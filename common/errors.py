@@ -1,9 +1,13 @@
-"""Mistakes of a user, as opposed to defects of ours.
+"""Mistakes of a user and failures of the machine, as opposed to defects of ours.
 
-A `UserError` ends a command with one line and exit status 2; every other exception is a defect and keeps its traceback.
+A `UserError` ends a command with one line and exit status 2, a `MachineError` with exit status 74; every other
+exception is a defect and keeps its traceback.
 """
 
-from collections.abc import Mapping
+import contextlib
+import errno
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,65 @@ class UserError(click.ClickException, ValueError):
     """
 
     exit_code = 2
+
+
+class MachineError(UserError):
+    """The machine failed, not the user: a disk that is full or broken, too little memory.
+
+    The same command goes on once that is mended.
+    """
+
+    exit_code = 74  # EX_IOERR of sysexits.h
+
+
+_FULL = "free some space, then run the same command again"
+_RIGHTS = "choose another folder or change its rights"
+_REMEDIES = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EIO: "check the disk, then run the same command again",
+    errno.ESTALE: "check the disk, then run the same command again",
+    errno.EROFS: _RIGHTS,
+    errno.EACCES: _RIGHTS,
+    errno.EPERM: _RIGHTS,
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "raise the machine's limit of open files",
+    errno.ENOMEM: "free some memory, then run the same command again",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+def failure_of_machine(error: BaseException) -> MachineError | None:
+    """Return an exception as a failure of the machine, which says what to do; None where it is none of that."""
+    if isinstance(error, OSError) and error.errno in _REMEDIES:
+        where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
+        return MachineError(f"{where}{os.strerror(error.errno)}; {_REMEDIES[error.errno]}")
+    # PyTorch says so with a RuntimeError.
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error)):
+        return MachineError("not enough memory; free some, or lift its limit, then run the same command again")
+    return None
+
+
+@contextlib.contextmanager
+def naming(path: Path, instead: Path | None = None) -> Iterator[None]:
+    """Let failures of the system inside say that they are of `path`: those of a write or an fsync name no file.
+
+    Args:
+        path: what is written or read.
+        instead: a temporary name of it, which is not to be told.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None:
+            told = error.filename
+            if told is None:
+                error.filename = str(path)
+            elif instead is not None and isinstance(told, str | os.PathLike):
+                inside = os.path.relpath(os.fspath(told), instead)
+                if inside != os.pardir and not inside.startswith(os.pardir + os.sep):
+                    error.filename = os.path.normpath(path / inside)
+        raise
 
 
 def refuse_other(folder: Path, what: str, theirs: Any, ours: Any, way_out: str) -> None:

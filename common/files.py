@@ -18,7 +18,7 @@ from typing import Any
 
 import filelock
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, naming
 
 TEMPORARY_PREFIX = ".tmp-"
 LOCK_NAME = ".lock"
@@ -26,17 +26,26 @@ LOCK_NAME = ".lock"
 
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as 64 hexadecimal digits."""
-    with path.open("rb") as file:
+    with naming(path), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fsync_folder(folder: Path) -> None:
     """Make a rename inside `folder` durable; the content of a file likewise."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with naming(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, durably; one that is there is kept."""
+    new = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in new:
+        fsync_folder(one.parent)
 
 
 @contextlib.contextmanager
@@ -50,18 +59,20 @@ def committed(path: Path, verify: Callable[[Path], None] | None = None) -> Itera
     Raises:
         Whatever the body or `verify` raises; the temporary file is then removed and `path` is untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
+    _remove_orphans(path)
     temporary = _temporary(path)
     try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        if verify is not None:
-            verify(temporary)
-        temporary.replace(path)
-        fsync_folder(path.parent)
+        with naming(path, temporary):
+            yield temporary
+            fsync_folder(temporary)
+            if verify is not None:
+                verify(temporary)
+            temporary.replace(path)
+            fsync_folder(path.parent)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise
 
 
@@ -83,25 +94,26 @@ def committed_folder(
     Raises:
         Whatever the body or `compare` raises; the temporary folder is then removed and `path` is untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     _remove_orphans(path)
     temporary = _temporary(path)
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
     try:
-        yield temporary
-        for part in [*temporary.rglob("*"), temporary]:
-            fsync_folder(part)
-        if replace and path.exists():
-            remove_folder(path)
-        try:
-            temporary.replace(path)
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
-            if compare is not None:
-                compare(temporary, path)
-        fsync_folder(path.parent)
+        with naming(path, temporary):
+            temporary.mkdir()
+            yield temporary
+            for part in [*temporary.rglob("*"), temporary]:
+                fsync_folder(part)
+            if replace and path.exists():
+                remove_folder(path)
+            try:
+                temporary.replace(path)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                if compare is not None:
+                    compare(temporary, path)
+            fsync_folder(path.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -123,7 +135,7 @@ def _remove_orphans(path: Path) -> None:
     for leftover in path.parent.glob(f"{mine}*-{path.name}*"):
         owner = leftover.name.removeprefix(mine).split("-")[0]
         if owner.isdigit() and not _alive(int(owner)):
-            shutil.rmtree(leftover, ignore_errors=True)
+            _remove(leftover)
 
 
 def _alive(process: int) -> bool:
@@ -245,9 +257,15 @@ def remove_temporaries(folder: Path) -> None:
     The caller holds the folder's lock, so that no writer is at work.
     """
     for leftover in folder.glob(f"{TEMPORARY_PREFIX}*"):
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover, ignore_errors=True)
-        else:
+        _remove(leftover)
+
+
+def _remove(leftover: Path) -> None:
+    """Remove a temporary file or folder as far as that is possible; the next start tries again."""
+    if leftover.is_dir() and not leftover.is_symlink():
+        shutil.rmtree(leftover, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
             leftover.unlink(missing_ok=True)
 
 
@@ -258,8 +276,9 @@ def writable_folder(folder: Path, what: str) -> Path:
         UserError: it cannot be made or written to.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-probe"
+        make_folder(folder)
+        probe = _temporary(folder / "probe")
+        _remove_orphans(folder / "probe")
         probe.touch()
         probe.unlink()
     except OSError as error:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import click
 
 import graspq
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, failure_of_machine
 
 S = TypeVar("S", bound="Settings")
 INTERRUPTED = 130
@@ -306,6 +306,12 @@ class _OneLineErrors:
         except BrokenPipeError:
             sys.stderr.close()
             sys.exit(1)
+        except (OSError, MemoryError, RuntimeError) as error:
+            failure = failure_of_machine(error)
+            if failure is None:
+                raise
+            click.echo(f"error: {_one_line(failure.message)}", err=True)
+            sys.exit(failure.exit_code)
         sys.exit(result if isinstance(result, int) else 0)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from graspq.common.errors import UserError, refuse_other
+from graspq.common.errors import MachineError, UserError, failure_of_machine, refuse_other
 from graspq.common.files import read_json
 
 PLAN_FILE = "plan.json"
@@ -85,6 +85,7 @@ def carry_out(
 
     Raises:
         KeyboardInterrupt: a signal asked the plan to end; the same call goes on with it.
+        MachineError: the machine fails, such as a full disk, which would fail the other units too; so does the call.
     """
     waiting: list[U] = []
     for unit in units:
@@ -103,11 +104,16 @@ def carry_out(
 def _attempt(unit: Unit, keep_going: bool) -> str | None:
     try:
         unit.run()
+    except MachineError:
+        raise
     except UserError as error:
         if not keep_going:
             raise
         return error.message
     except Exception as error:  # a defect: the others go on, and its traceback is shown
+        failure = failure_of_machine(error)
+        if failure is not None:
+            raise failure from None
         if not keep_going:
             raise
         traceback.print_exc()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, failure_of_machine
 
 U_contra = TypeVar("U_contra", contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
@@ -46,7 +46,7 @@ class Done(Generic[R]):
 
 @dataclass(frozen=True)
 class Mistake:
-    """A unit raised a UserError with this message."""
+    """A unit raised a UserError with this message, or the machine failed it."""
 
     message: str
 
@@ -96,8 +96,9 @@ class Bench:
             return Done(self._do(unit))
         except UserError as error:
             return Mistake(error.message)
-        except BaseException:
-            return Failed(traceback.format_exc())
+        except BaseException as error:
+            failure = failure_of_machine(error)
+            return Mistake(failure.message) if failure is not None else Failed(traceback.format_exc())
 
     def close(self) -> None:
         """Leave the work."""

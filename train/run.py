@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, naming
 from graspq.common.files import (
+    fsync_folder,
     locked,
     read_json,
     remove_folder,
@@ -175,8 +176,14 @@ class Run:
 
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Add a row to `metrics.jsonl`."""
-        with self.metrics_file.open("a") as file:
+        with naming(self.metrics_file), self.metrics_file.open("a") as file:
             file.write(json.dumps(row, allow_nan=False) + "\n")
+
+    def sync_metrics(self) -> None:
+        """Put the rows so far on the disk: no checkpoint may outlive the rows of the steps before it."""
+        if self.metrics_file.exists():
+            fsync_folder(self.metrics_file)
+            fsync_folder(self.folder)
 
     def forget_after(self, step: int) -> None:
         """Drop the metrics of later steps, which will be taken again."""

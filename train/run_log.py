@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from graspq.common.errors import naming
 from graspq.train.estimator import Metrics
 from graspq.train.run import Run
 from graspq.train.settings import TrainSettings
@@ -33,8 +34,9 @@ class RunLog:
         from torch.utils.tensorboard import SummaryWriter
 
         self._run, self._batch_size, self._writes = run, settings.batch_size, writes
-        folder = str(run.folder / "tensorboard")
-        self._writer = SummaryWriter(folder, purge_step=step + 1) if writes else None
+        self._folder = run.folder / "tensorboard"
+        with naming(self._folder):
+            self._writer = SummaryWriter(str(self._folder), purge_step=step + 1) if writes else None
         # A log file gets a line every half minute instead of a moving bar.
         interval = 0.5 if sys.stderr.isatty() else 30.0
         self._bar = tqdm(
@@ -58,7 +60,8 @@ class RunLog:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
         if self._writer is not None:
-            self._writer.close()
+            with naming(self._folder):
+                self._writer.close()
 
     @contextlib.contextmanager
     def timed(self) -> Iterator[None]:
@@ -119,9 +122,10 @@ class RunLog:
         if self._writer is None:
             return
         self._run.append_metrics(row)
-        for name, value in values.items():
-            if isinstance(value, int | float):
-                self._writer.add_scalar(f"{group}/{name}", value, step)
+        with naming(self._folder):
+            for name, value in values.items():
+                if isinstance(value, int | float):
+                    self._writer.add_scalar(f"{group}/{name}", value, step)
 
     def _show(self, values: dict[str, str]) -> None:
         self._shown |= values

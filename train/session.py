@@ -83,6 +83,7 @@ class Session:
             return
         self._check_weights()
         if self.ranks.first:
+            self.run.sync_metrics()
             save_checkpoint(self.run.checkpoints_folder, self.state)
             self.run.prune()
         self.saved_step = self.state.step

@@ -13,7 +13,8 @@ from typing import Any
 
 import click
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, naming
+from graspq.common.files import make_folder
 
 MODULES = {
     "grasp-train": "graspq.train.cli",
@@ -42,8 +43,8 @@ class CommandLine:
 
     def call(self, log: Path) -> tuple[int, str]:
         """Run the command with its output in `log`; return its exit status and the last line that it wrote."""
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with _output_to(log):
+        make_folder(log.parent)
+        with naming(log), _output_to(log):
             print(f"$ {self}", flush=True)
             status = self._status()
         lines = [line.strip() for line in log.read_text(errors="replace").replace("\r", "\n").splitlines()]
@@ -76,11 +77,13 @@ def _output_to(log: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            file.flush()
             sys.stdout, sys.stderr = written
-            for number, before in zip((1, 2), kept, strict=True):
-                os.dup2(before, number)
-                os.close(before)
+            try:
+                file.flush()
+            finally:
+                for number, before in zip((1, 2), kept, strict=True):
+                    os.dup2(before, number)
+                    os.close(before)
 
 
 def training_script(on_policy: bool) -> str:

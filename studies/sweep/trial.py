@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from graspq.common.errors import UserError
+from graspq.common.errors import MachineError, UserError
 from graspq.common.files import read_json, write_json
 from graspq.common.options import INTERRUPTED
 from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
@@ -176,6 +176,7 @@ class Trial:
 
         Raises:
             UserError: one failed, which is noted: it is not run again unless asked.
+            MachineError: the machine failed one, which is not noted.
             KeyboardInterrupt: a command was asked to end; it has kept what it had.
         """
         before: CommandLine | None = None
@@ -183,6 +184,8 @@ class Trial:
             status, last = command.call(self.log)
             if status == INTERRUPTED:
                 raise KeyboardInterrupt
+            if status == MachineError.exit_code:  # no fault of the trial's: the same command tries it again
+                raise MachineError(f"{last} (in {self.log})")
             if status != 0:
                 reason = last or f"{command.script} ended with status {status}"
             elif command == before:

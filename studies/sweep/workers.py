@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from graspq.common.errors import UserError
+from graspq.common.errors import MachineError, UserError
 from graspq.common.files import cache_folder, read_json, write_json
 from graspq.datasets.dataset import open_shards
 from graspq.engine import LostUnitsError, Place, run
@@ -133,6 +133,8 @@ def _files_of(shards: tuple[str, ...]) -> tuple[Path, ...]:
 def _error(trial: Trial) -> str | None:
     try:
         trial.run()
+    except MachineError:
+        raise  # it would fail the others too
     except UserError as error:
         return error.message
     return None

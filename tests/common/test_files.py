@@ -126,6 +126,24 @@ with committed_folder(Path(sys.argv[1])) as temporary:
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
+def test_what_a_killed_writer_of_a_file_left_is_removed_by_the_next_and_the_living_are_let_be(tmp_path):
+    code = """
+import os, signal, sys
+from pathlib import Path
+from graspq.common.files import committed
+with committed(Path(sys.argv[1])) as temporary:
+    temporary.touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    path = tmp_path / "file"
+    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    of_the_living = left.with_name(left.name.replace(left.name.split("-")[-2], str(os.getppid())))
+    of_the_living.touch()
+    write_json(path, 1)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"file", of_the_living.name}
+
+
 def test_one_process_holds_a_folder_and_a_killed_one_holds_nothing(tmp_path):
     code = """
 import sys, time
