@@ -20,6 +20,8 @@ if not hasattr(sys.modules.get("tests"), "__file__"):
 from graspq.common.files import write_json, write_text  # noqa: E402
 from tests.faults.harness import GOOD, Log, Work, code_digest, rows_of, table, try_kind  # noqa: E402
 from tests.faults.kinds import KINDS  # noqa: E402
+from tests.faults.planted import PLANTED, found_by  # noqa: E402
+from tests.faults.system_calls import shim  # noqa: E402
 
 START, END = "<!-- made by tests/faults -->", "<!-- end of faults -->"
 
@@ -29,12 +31,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--kind", action="append", help="only kinds whose name holds this; may be repeated")
     parser.add_argument("--short", action="store_true", help="the few that `make test` tries; publishes nothing")
+    parser.add_argument("--planted", action="store_true", help="plant defects, each of which must be found")
     parser.add_argument("--limit-minutes", type=float, default=float("inf"), help="stop after so long")
     given = parser.parse_args()
     until = time.monotonic() + 60 * given.limit_minutes
     folder = ROOT / "runs" / "faults"
     log, found = Log(folder / "tried.jsonl"), []
-    with Work(folder / code_digest()) as work:
+    with Work(folder / code_digest(), shim=shim(folder)) as work:
+        if given.planted:
+            return try_planted(work, given.kind)
         for kind in KINDS:
             code = code_digest(Path(sys.modules[type(kind).__module__].__file__ or ""))
             if given.kind is None or any(name in kind.name for name in given.kind):
@@ -51,6 +56,19 @@ def main() -> int:
     if not given.short:
         publish(rows, text)
     return int(any(one.outcome not in GOOD for _, one in found))
+
+
+def try_planted(work: Work, kinds: list[str] | None) -> int:
+    """Plant each defect and say what found it; return 1 where one was not found."""
+    missed = 0
+    for planted in PLANTED:
+        if kinds is None or any(name in planted.kind for name in kinds):
+            kind = next(kind for kind in KINDS if kind.name == planted.kind)
+            red = found_by(planted, kind, work)
+            missed += red is None
+            how = "NOT FOUND" if red is None else f"{red[0].command}, {red[0].name}: {red[1].outcome}: {red[1].said}"
+            print(f"{planted.name} ({planted.kind}): {how}", flush=True)
+    return int(missed > 0)
 
 
 def publish(rows: list[dict[str, object]], text: str) -> None:

@@ -161,14 +161,15 @@ class Work:
     Attributes:
         folder: everything is below it.
         inputs: the inputs; read only.
-        source: a copy of the source tree whose code runs in the place of this one's; see `planted`.
+        source: folder that `graspq` is imported from in the place of this tree; see `planted`.
+        shim: `shim.c`, compiled; None where there is no compiler.
     """
 
     def __init__(self, folder: Path, source: Path | None = None, shim: Path | None = None) -> None:
         self.folder, self.inputs, self.source = folder.absolute(), folder.absolute() / "inputs", source
-        self._shim = shim
+        self.shim = shim
         self._template: subprocess.Popen[str] | None = None
-        self._cases = 0
+        self._own = self.folder / "cases" / str(os.getpid())  # two may work here at once
         self.inputs.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> "Work":
@@ -180,7 +181,7 @@ class Work:
             self._template.stdin.close()
             self._template.wait()
             self._template = None
-        shutil.rmtree(self.folder / "cases", ignore_errors=True)
+        shutil.rmtree(self._own, ignore_errors=True)
 
     def made(self, name: str) -> Path:
         """Return an input, made with all that it needs if it is not there yet; to read only."""
@@ -213,8 +214,8 @@ class Work:
 
         It is the working folder for commands, and is removed afterwards.
         """
-        self._cases += 1
-        case = self.folder / "cases" / f"{os.getpid()}-{self._cases}"
+        # One after the other, all have the same path: it stands in some files.
+        case = next(self._own / str(number) for number in range(100) if not (self._own / str(number)).exists())
         case.mkdir(parents=True)
         try:
             for name in names:
@@ -302,8 +303,8 @@ class Work:
         """
         template = self._started()
         assert template.stdin is not None and template.stdout is not None
-        said = self.folder / "said"
-        said.mkdir(exist_ok=True)
+        said = self._own / "said"
+        said.mkdir(parents=True, exist_ok=True)
         request = {
             "argv": [str(word) for word in argv], "cwd": str(cwd), "env": self.environment(env), "stdin": stdin,
             "stdout": str(said / "out"), "stderr": str(said / "err"), "seconds": seconds, "limits": dict(limits or {}),
@@ -313,6 +314,12 @@ class Work:
         answer = json.loads(template.stdout.readline())
         out, err = ((said / name).read_text(errors="replace") for name in ("out", "err"))
         return Ran(stdout=out, stderr=err, **answer)
+
+    @property
+    def address_space(self) -> int:
+        """Bytes of address space that a forked command has when it begins."""
+        sizes = Path(f"/proc/{self._started().pid}/statm").read_text().split()
+        return int(sizes[0]) * os.sysconf("SC_PAGE_SIZE")
 
     def environment(self, changed: Mapping[str, str] | None = None) -> dict[str, str]:
         """Return the variables of a command: one thread, a temporary folder of the harness, the code of `source`."""
@@ -325,7 +332,7 @@ class Work:
 
     def _started(self) -> "subprocess.Popen[str]":
         if self._template is None or self._template.poll() is not None:
-            shim = {} if self._shim is None else {"LD_PRELOAD": str(self._shim)}
+            shim = {} if self.shim is None else {"LD_PRELOAD": str(self.shim)}
             self._template = subprocess.Popen(
                 [sys.executable, HERE / "template.py"],
                 env=self.environment(shim),
@@ -356,7 +363,7 @@ def code_digest(*files: Path) -> str:
     """Return one SHA-256 of the product's code, of the harness and of the files of a kind."""
     packages = [path.parent for path in ROOT.glob("*/__init__.py") if path.parent.name != "tests"]
     product = [path for folder in packages for path in folder.rglob("*") if path.suffix in (".py", ".html")]
-    shared = [HERE / name for name in ("harness.py", "template.py", "small_dataset.py")]
+    shared = [HERE / name for name in ("harness.py", "template.py", "small_dataset.py", "system_calls.py", "shim.c")]
     whole = hashlib.sha256()
     for path in sorted({*product, *shared, *files}):
         whole.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes() + b"\0")

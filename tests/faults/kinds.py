@@ -1,5 +1,18 @@
 """All kinds of faults, in the order of the table."""
 
+from tests.faults.crash_points import CrashPoints, KilledByStrace
+from tests.faults.failing_calls import FullDisk, Limits, ReadOnly, failing_calls
 from tests.faults.harness import Kind
+from tests.faults.power_loss import PowerLoss
 
-KINDS: list[Kind] = []
+KINDS: list[Kind] = [
+    CrashPoints(),
+    CrashPoints("SIGKILL in the midst of a write", half=True),
+    KilledByStrace(),
+    PowerLoss(),
+    *failing_calls(),
+    FullDisk(),
+    ReadOnly(),
+    Limits("few open files (ulimit -n)", "RLIMIT_NOFILE", (64, 32, 24, 16)),
+    Limits("little memory (ulimit -v), MiB above the start", "RLIMIT_AS", (64, 16, 256)),
+]

@@ -1,9 +1,11 @@
 """Collects a dataset of tiny shards by grasp-datagen's own code: `small_dataset.py SIZE OUT OBJECTS`."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
+
+from graspq.common.options import Command
 from graspq.datagen.making import make_dataset
 from graspq.datagen.settings import CollectionSettings, DatagenSettings
 
@@ -17,6 +19,14 @@ class SmallDatagenSettings(DatagenSettings):
         return CollectionSettings(seed=self.seed, block_size=4, blocks_per_shard=2)
 
 
+@click.command(cls=Command)
+@click.argument("size", type=int)
+@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("objects", type=click.Path(path_type=Path))
+def main(size: int, out: Path, objects: Path) -> None:
+    """Collect it."""
+    make_dataset(SmallDatagenSettings(size=size, out=out, objects=objects, workers=0))
+
+
 if __name__ == "__main__":
-    size, out, objects = sys.argv[1:]
-    make_dataset(SmallDatagenSettings(size=int(size), out=Path(out), objects=Path(objects), workers=0))
+    main()

@@ -1,0 +1,109 @@
+"""SIGKILL at the N-th system call that changes a file, for every N; then the same command again."""
+
+import os
+import shutil
+import signal
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.faults.harness import Fault, Ran, Tried, Work
+from tests.faults.system_calls import (
+    CHANGES,
+    FSYNC,
+    KILL,
+    KILL_HALF,
+    OF_COMMAND,
+    RENAME,
+    SHORT,
+    WRITE,
+    Scenario,
+    Stage,
+    armed,
+    compared,
+    difference,
+    scenarios,
+)
+
+
+@dataclass
+class CrashPoints:
+    """Killed before the N-th call, or in the midst of the N-th write."""
+
+    name: str = "SIGKILL at a system call"
+    half: bool = False
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return one for every call that changes a file."""
+        stage = stage_of(work)
+        for scenario in scenarios(work, short):
+            count = stage.unbroken(scenario).count(WRITE if self.half else CHANGES)
+            numbers = range(1, count + 1)
+            for number in few(numbers, 1) if short else numbers:
+                yield Fault(self.name, scenario.command, f"{number}")
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Kill the command and start it again."""
+        stage, scenario = stage_of(work), OF_COMMAND[fault.command]
+        with stage.begun(scenario) as case:
+            what = (
+                armed(case, KILL_HALF, int(fault.name), calls=WRITE)
+                if self.half
+                else armed(case, KILL, int(fault.name))
+            )
+            killed = work.forked(scenario.argv, case, armed=what)
+            if killed.rc != -signal.SIGKILL:
+                return killed.broken() or Tried("survived", "ended before that call")
+            return gone_on(work.forked(scenario.argv, case), scenario, case, stage)
+
+
+@dataclass
+class KilledByStrace:
+    """The same of some calls, with a process that is started anew and a kernel's tracer that kills it."""
+
+    name: str = "SIGKILL at a system call (strace)"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return a few for each command."""
+        for scenario in scenarios(work, short, SHORT[:1]) if shutil.which("strace") is not None else ():
+            unbroken = stage_of(work).unbroken(scenario)
+            for name, calls in (("fsync", FSYNC), ("rename", RENAME)):
+                numbers = range(1, unbroken.count(calls) + 1)
+                for number in numbers[-1:] if short else few(numbers, 3):
+                    yield Fault(self.name, scenario.command, f"{name} {number}")
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Kill the command and start it again."""
+        stage, scenario = stage_of(work), OF_COMMAND[fault.command]
+        name, number = fault.name.split()
+        with stage.begun(scenario) as case:
+            tracer = ("strace", "-f", "-qq", "-o", os.devnull, "-e", f"trace={name}")
+            what = f"inject={name}:signal=KILL:when={number}"
+            killed = work.run(scenario.argv, case, before=(*tracer, "-e", what))
+            if killed.rc == 0:
+                return Tried("silently wrong", "was not killed")
+            return gone_on(work.forked(scenario.argv, case), scenario, case, stage)
+
+
+_STAGES: dict[Work, Stage] = {}
+
+
+def stage_of(work: Work) -> Stage:
+    """Return the stage of a work; all kinds share it."""
+    return _STAGES.setdefault(work, Stage(work))
+
+
+def few(numbers: range, count: int) -> list[int]:
+    """Return some numbers, evenly spread."""
+    return sorted({numbers[(2 * one + 1) * len(numbers) // (2 * count)] for one in range(count)}) if numbers else []
+
+
+def gone_on(again: Ran, scenario: Scenario, case: Path, stage: Stage) -> Tried:
+    """Judge the same command, run again after it was broken off."""
+    broken = again.broken()
+    if broken is not None:
+        return broken
+    if again.rc != 0:
+        return Tried("lost", again.line)
+    differs = difference(compared(case), stage.unbroken(scenario).files)
+    return Tried("survived") if differs is None else Tried("silently wrong", differs)

@@ -1,0 +1,187 @@
+"""System calls that fail, a full disk, a folder that cannot be written to, and limits of files and memory.
+
+The command must say so in one line that names a file or folder of its own, and go on once there is room.
+"""
+
+import errno
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.faults.crash_points import few, gone_on, stage_of
+from tests.faults.harness import Fault, Ran, Tried, Work
+from tests.faults.system_calls import (
+    CREATE,
+    FAIL,
+    FAIL_ON,
+    FSYNC,
+    MKDIR,
+    OF_COMMAND,
+    OPEN,
+    READ,
+    RENAME,
+    SHORT,
+    WRITE,
+    Scenario,
+    Stage,
+    armed,
+    compared,
+    difference,
+    scenarios,
+)
+
+MOST = 24  # of each kind and command, evenly spread
+
+
+def judged(ran: Ran, scenario: Scenario, stage: Stage, case: Path, again: Ran | None) -> Tried:
+    """Judge a command that met a failure, and the same command after it."""
+    broken = ran.broken()
+    if broken is not None:
+        return broken
+    if ran.rc == 0:
+        differs = difference(compared(case), stage.unbroken(scenario).files)
+        return Tried("survived") if differs is None else Tried("silently wrong", differs)
+    if not any(
+        name in ran.line
+        for name in ("new", "data/regular-24", "runs/mc", "objects/", "page.md", "plan.toml", str(case))
+    ):
+        return Tried("silently wrong", f"names no file: {ran.line}")
+    assert again is not None
+    after = gone_on(again, scenario, case, stage)
+    return Tried("detected", ran.line) if after.outcome == "survived" else after
+
+
+@dataclass
+class FailingCalls:
+    """The N-th of some calls fails, or that and all later ones."""
+
+    name: str
+    calls: int
+    error: int
+    mode: int = FAIL
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return one for some of the calls of each command."""
+        for scenario in scenarios(work, short, SHORT[:1]):
+            count = stage_of(work).unbroken(scenario).count(self.calls)
+            for number in few(range(1, count + 1), 1 if short else MOST):
+                yield Fault(self.name, scenario.command, f"{number}")
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command with the failure, then without."""
+        stage, scenario = stage_of(work), OF_COMMAND[fault.command]
+        with stage.begun(scenario) as case:
+            what = armed(case, self.mode, int(fault.name), error=self.error, calls=self.calls)
+            ran = work.forked(scenario.argv, case, armed=what)
+            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
+            return judged(ran, scenario, stage, case, again)
+
+
+def failing_calls() -> list[FailingCalls]:
+    """Return a kind for each call and error."""
+    once = {"write": WRITE, "fsync": FSYNC, "rename": RENAME, "open": OPEN | CREATE, "read": READ}
+    kinds = [FailingCalls(f"EIO in {name}", calls, errno.EIO) for name, calls in once.items()]
+    # A disk that is full stays so.
+    full = {"write": WRITE, "fsync": FSYNC, "rename": RENAME, "open": CREATE | MKDIR}
+    return kinds + [FailingCalls(f"ENOSPC in {name}", calls, errno.ENOSPC, FAIL_ON) for name, calls in full.items()]
+
+
+@contextmanager
+def mounted(case: Path, *options: str) -> Iterator[None]:
+    """Mount something over a folder, and take it away again."""
+    subprocess.run(["mount", *options, str(case)], check=True, capture_output=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(case)], check=True, capture_output=True)
+
+
+def can_mount() -> bool:
+    """Return whether this process may mount."""
+    return os.geteuid() == 0 and shutil.which("mount") is not None
+
+
+@dataclass
+class FullDisk:
+    """A file system in memory that has room for a part of what the command writes."""
+
+    name: str = "full disk"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return some sizes for each command."""
+        for scenario in scenarios(work, short, SHORT[:1]) if can_mount() else ():
+            for percent in (50,) if short else range(5, 100, 10):
+                yield Fault(self.name, scenario.command, f"{percent} % of the room")
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command there, then again with more room."""
+        stage, scenario = stage_of(work), OF_COMMAND[fault.command]
+        start = stage.start(scenario)
+        before = _pages(start)
+        with stage.begun(scenario) as case:
+            ran = work.forked(scenario.argv, case)
+            needed = _pages(case) - before
+        room = before + int(fault.name.split()[0]) * needed // 100 + 8
+        with work.copy() as case, mounted(case, "-t", "tmpfs", "-o", f"size={4 * room}k", "tmpfs"):
+            shutil.copytree(start, case, symlinks=True, dirs_exist_ok=True)
+            ran = work.forked(scenario.argv, case)
+            subprocess.run(["mount", "-o", "remount,size=256m", str(case)], check=True)
+            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
+            return judged(ran, scenario, stage, case, again)
+
+
+def _pages(folder: Path) -> int:
+    """Return how many pages of 4 kB a file system in memory needs for a folder, folders and links counted as one."""
+    return sum(1 + (path.lstat().st_size + 4095) // 4096 for path in folder.rglob("*"))
+
+
+@dataclass
+class ReadOnly:
+    """A working folder that is mounted read-only."""
+
+    name: str = "read-only file system"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return one for each command."""
+        for scenario in scenarios(work, short, SHORT[:1]) if can_mount() else ():
+            yield Fault(self.name, scenario.command, "whole working folder")
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command there, then again where it can write."""
+        stage, scenario = stage_of(work), OF_COMMAND[fault.command]
+        with stage.begun(scenario) as case:
+            with mounted(case, "--bind", str(case)):
+                subprocess.run(["mount", "-o", "remount,bind,ro", str(case)], check=True)
+                ran = work.forked(scenario.argv, case)
+            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
+            return judged(ran, scenario, stage, case, again)
+
+
+@dataclass
+class Limits:
+    """Few open files, or little memory more than the command has when it begins."""
+
+    name: str
+    limit: str
+    values: tuple[int, ...]
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return some limits for each command."""
+        for scenario in scenarios(work, short, SHORT[:1]):
+            for value in self.values[:1] if short else self.values:
+                yield Fault(self.name, scenario.command, f"{value}")
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command with the limit, then without."""
+        stage, scenario = stage_of(work), OF_COMMAND[fault.command]
+        value = int(fault.name)
+        if self.limit == "RLIMIT_AS":
+            value = value * 2**20 + work.address_space
+        with stage.begun(scenario) as case:
+            ran = work.forked(scenario.argv, case, limits={self.limit: value})
+            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
+            return judged(ran, scenario, stage, case, again)

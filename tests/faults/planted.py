@@ -1,0 +1,160 @@
+"""Defects that are planted in a copy of the source: each must turn its kind of fault red.
+
+`python -P tests/faults --planted` tries them all, and names a fault that found each.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.faults.harness import GOOD, ROOT, Fault, Kind, Tried, Work
+
+
+@dataclass(frozen=True)
+class Planted:
+    """A defect: a textual change of a file.
+
+    Attributes:
+        name: what is wrong then.
+        file: path of the file below the root.
+        old: a text that stands there once.
+        new: what takes its place.
+        kind: name of the kind of fault that must find it.
+        commands: whose faults are tried, in this order, until one finds it.
+        most: at most so many faults are tried of each command, evenly spread; all where it is 0.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    kind: str
+    commands: tuple[str, ...]
+    most: int = 0
+
+
+FILES = "common/files.py"
+RENAMED = "            temporary.replace(path)\n            fsync_folder(path.parent)\n    except"
+PLANTED = [
+    Planted(
+        "a file is not synced before its rename",
+        FILES,
+        "            fsync_folder(temporary)\n",
+        "",
+        "power loss",
+        ("grasp-eval", "grasp-datagen"),
+        12,
+    ),
+    Planted(
+        "a folder is not synced after a rename in it",
+        FILES,
+        RENAMED,
+        "            temporary.replace(path)\n    except",
+        "power loss",
+        ("grasp-eval", "grasp-datagen"),
+    ),
+    Planted(
+        "a new folder is not synced in the one above",
+        FILES,
+        "    for one in new:\n        fsync_folder(one.parent)\n",
+        "",
+        "power loss",
+        ("grasp-objects make", "grasp-eval"),
+    ),
+    Planted(
+        "the files of a folder are not synced before its rename",
+        FILES,
+        '            for part in [*temporary.rglob("*"), temporary]:\n                fsync_folder(part)\n',
+        "",
+        "power loss",
+        ("grasp-objects make",),
+    ),
+    Planted(
+        "a checkpoint outlives the metrics before it",
+        "train/session.py",
+        "            self.run.sync_metrics()\n",
+        "",
+        "power loss",
+        ("grasp-train",),
+    ),
+    Planted(
+        "a file has its name before it is written",
+        FILES,
+        "    temporary = _temporary(path)\n    try:\n        with naming(path, temporary):\n            yield",
+        "    temporary = path\n    try:\n        with naming(path, temporary):\n            yield",
+        "SIGKILL in the midst of a write",
+        ("grasp-datagen", "grasp-train"),
+    ),
+    Planted(
+        "what a killed writer has left stays for ever",
+        FILES,
+        "            _remove(leftover)\n\n\ndef _alive",
+        "            pass\n\n\ndef _alive",
+        "SIGKILL at a system call",
+        ("grasp-eval",),
+        12,
+    ),
+    Planted(
+        "metrics that cannot be written are left out",
+        "train/run.py",
+        '        with naming(self.metrics_file), self.metrics_file.open("a") as file:',
+        '        with contextlib.suppress(OSError), self.metrics_file.open("a") as file:',
+        "EIO in write",
+        ("grasp-train",),
+    ),
+    Planted(
+        "a failure of the disk is taken for a defect",
+        "common/options.py",
+        "            if failure is None:\n",
+        "            if failure is not None:\n",
+        "EIO in fsync",
+        ("grasp-eval", "grasp-train"),
+    ),
+]
+
+
+def source_with(planted: Planted, folder: Path) -> Path:
+    """Return a folder to import `graspq` from, in which a defect is planted."""
+    site = folder / "site"
+    shutil.rmtree(site, ignore_errors=True)
+    shutil.copytree(ROOT / "graspq", site / "graspq")
+    for init in ROOT.glob("*/__init__.py"):
+        if init.parent.name != "graspq":
+            shutil.copytree(init.parent, site / "graspq" / init.parent.name)
+    path = site / "graspq" / planted.file
+    text = path.read_text()
+    if text.count(planted.old) != 1:
+        raise ValueError(f"{planted.name}: its text stands {text.count(planted.old)} times in {planted.file}")
+    path.write_text(text.replace(planted.old, planted.new))
+    return site
+
+
+def found_by(planted: Planted, kind: Kind, work: Work) -> tuple[Fault, Tried] | None:
+    """Return a fault that turned red, or None where the defect was not found.
+
+    Args:
+        planted: the defect.
+        kind: of the name that it asks for.
+        work: with the sound code; its inputs are used.
+    """
+    folder = work.folder / "planted" / "-".join(planted.name.split())
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("inputs", "starts"):
+        (work.folder / name).mkdir(exist_ok=True)
+        if not (folder / name).is_symlink():
+            (folder / name).symlink_to(work.folder / name)
+    with Work(folder, source_with(planted, folder), work.shim) as broken:
+        for fault in _asked(planted, list(kind.faults(broken, False))):
+            tried = kind.tried(fault, broken)
+            if tried.outcome not in GOOD:
+                return fault, tried
+    return None
+
+
+def _asked(planted: Planted, faults: Sequence[Fault]) -> Iterator[Fault]:
+    for command in planted.commands:
+        here = [fault for fault in faults if fault.command == command]
+        count = min(planted.most or len(here), len(here))
+        yield from (here[(2 * one + 1) * len(here) // (2 * count)] for one in range(count))
+        yield from here[-1:]
