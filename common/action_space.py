@@ -8,6 +8,8 @@ from typing import Any
 
 from graspq.common.errors import UserError
 
+LARGEST = 1e6  # of a limit, whatever its unit
+
 
 @dataclasses.dataclass(frozen=True)
 class ActionSpace:
@@ -42,7 +44,7 @@ class ActionSpace:
             raise UserError(
                 f"action space: expected {len(self.names)} entries of everything, one for each of {self.names}"
             )
-        if not all(limit > 0 for limit in self.limits) or not self.deviation > 0:
+        if not all(0 < number <= LARGEST for number in (*self.limits, self.deviation)):
             raise UserError(
                 f"action space: expected limits and a deviation above 0, got {self.limits}, {self.deviation}"
             )
@@ -68,12 +70,12 @@ class ActionSpace:
         Raises:
             UserError: it is none.
         """
-        parts: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
-        }
         try:
+            parts: dict[str, Any] = {
+                name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+            }
             return cls(**parts)
-        except TypeError as error:
+        except (TypeError, AttributeError) as error:
             raise UserError(f"action space {values!r}: not a description of an action ({error})") from None
 
 

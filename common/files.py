@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import socket
+import stat
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from typing import Any
 
 import filelock
 
-from graspq.common.errors import UserError, naming
+from graspq.common.errors import MachineError, UserError, failure_of_machine, naming
 
 TEMPORARY_PREFIX = ".tmp-"
 LOCK_NAME = ".lock"
@@ -214,6 +215,25 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def content_of(path: Path) -> bytes:
+    """Return the bytes of a regular file: one from a stranger may be a pipe, which would be waited for for ever.
+
+    Raises:
+        OSError: it is missing or no regular file.
+        MachineError: the machine failed, which tells nothing of the file.
+    """
+    try:
+        with naming(path):
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise OSError(errno.EINVAL, "not a regular file")
+            return path.read_bytes()
+    except OSError as error:
+        failure = failure_of_machine(error)
+        if failure is not None:
+            raise failure from None
+        raise
+
+
 def read_json(path: Path, what: str) -> Any:
     """Read a JSON file.
 
@@ -223,11 +243,14 @@ def read_json(path: Path, what: str) -> Any:
 
     Raises:
         UserError: the file is missing, unreadable or not JSON.
+        MachineError: see `content_of`.
     """
     try:
-        return json.loads(path.read_bytes())
+        return json.loads(content_of(path))
     except FileNotFoundError:
         raise UserError(f"{path}: no {what} here") from None
+    except MachineError:
+        raise
     # Text that is no UTF-8 and numbers of thousands of digits are ValueErrors too.
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a readable {what} ({error})") from None
@@ -244,10 +267,11 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
         UserError: the file is missing, unreadable or not TOML.
     """
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: {missing}") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    # A ValueError is also text that is no UTF-8 and a number of thousands of digits.
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a readable TOML file ({error})") from None
 
 

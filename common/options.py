@@ -6,6 +6,7 @@ JSON. Whatever is wrong with the user's input becomes one line on standard error
 
 import dataclasses
 import functools
+import math
 import re
 import sys
 import types
@@ -21,6 +22,8 @@ from graspq.common.errors import UserError, failure_of_machine
 
 S = TypeVar("S", bound="Settings")
 INTERRUPTED = 130
+LONGEST = 2000  # letters of a message: what it quotes may be a file
+MOST = 10**9  # of anything that is counted; what is made for each fits in memory
 
 
 def setting(
@@ -68,7 +71,7 @@ class Settings:
         """Check ranges and choices.
 
         Raises:
-            UserError: a value is outside its range or not one of its choices.
+            UserError: a value is outside its range, not finite, or not one of its choices.
         """
         hints = typing.get_type_hints(type(self))
         for field in dataclasses.fields(self):
@@ -78,7 +81,8 @@ class Settings:
             choices = typing.get_args(hints[field.name]) if _is_literal(hints[field.name]) else ()
             if choices and value not in choices:
                 raise UserError(f"{flag(field.name)}: {value!r} is unknown; choose from {', '.join(map(str, choices))}")
-            _check_range(field, value)
+            for one in value if isinstance(value, tuple) else (value,):
+                _check_range(field, one)
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings as plain JSON values."""
@@ -89,13 +93,25 @@ class Settings:
         """Return the settings that `to_json` wrote; unknown names are refused, missing ones take their defaults.
 
         Raises:
-            UserError: a name is unknown or a value is out of range.
+            UserError: a name is unknown, or a value is of another type or out of range.
         """
+        if not isinstance(values, dict):
+            raise UserError(f"settings {values!r}: expected names and values")
         hints = typing.get_type_hints(cls)
         known = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
             raise UserError(f"unknown setting {unknown[0]!r}; expected some of {', '.join(sorted(known))}")
+        for name, value in values.items():
+            if not _fits(hints[name], value):
+                raise UserError(f"setting {name}: {value!r} is no value of it")
+        lacking = [
+            field.name
+            for field in dataclasses.fields(cls)
+            if field.name not in values and field.default is field.default_factory is dataclasses.MISSING
+        ]
+        if lacking:
+            raise UserError(f"setting {lacking[0]} is missing")
         return cls(**{name: _restored(hints[name], value) for name, value in values.items()})
 
 
@@ -103,6 +119,8 @@ def _check_range(field: Any, value: Any) -> None:
     minimum, maximum = field.metadata.get("minimum"), field.metadata.get("maximum")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
+    if isinstance(value, float) and not math.isfinite(value):
+        raise UserError(f"{flag(field.name)}: expected a finite number, got {value}")
     too_low = minimum is not None and not value >= minimum
     too_high = maximum is not None and not value <= maximum
     if not too_low and not too_high:
@@ -110,6 +128,22 @@ def _check_range(field: Any, value: Any) -> None:
     limits = (("at least", minimum), ("at most", maximum))
     bounds = [f"{words} {limit:g}" for words, limit in limits if limit is not None]
     raise UserError(f"{flag(field.name)}: expected a number of {' and '.join(bounds)}, got {value}")
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    """Return whether a value of JSON, or one that `_restored` gave, can be one of a setting of this type."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return any(_fits(part, value) for part in typing.get_args(hint))
+    if hint in (type(None), None):
+        return value is None
+    if typing.get_origin(hint) is tuple:
+        inner = typing.get_args(hint)[0]
+        return isinstance(value, list | tuple) and all(_fits(inner, item) for item in value)
+    known: dict[Any, tuple[type, ...]] = {
+        int: (int,), float: (int, float), str: (str,), bool: (bool,), Path: (str, Path),
+    }  # fmt: skip
+    kinds = known.get(hint)
+    return kinds is None or (isinstance(value, kinds) and (hint is bool or not isinstance(value, bool)))
 
 
 def _plain(value: Any) -> Any:
@@ -138,13 +172,13 @@ def parse_count(text: str) -> int:
     """Return a count written plainly or with k or M: `2500`, `10k`, `1M`.
 
     Raises:
-        ValueError: the text is no whole number of at least 1.
+        ValueError: the text is no whole number of at least 1, or it is above a thousand million.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([kKmM]?)", text.strip())
     factor = {"": 1, "k": 1_000, "m": 1_000_000}
     value = float(match[1]) * factor[match[2].lower()] if match else 0.0
-    if value < 1 or value != int(value):
-        raise ValueError("expected a whole number of at least 1, such as 2500, 10k or 1M")
+    if not 1 <= value <= MOST or value != int(value):
+        raise ValueError("expected a whole number of at least 1, such as 2500, 10k or 1M, and at most 1000M")
     return int(value)
 
 
@@ -316,7 +350,8 @@ class _OneLineErrors:
 
 
 def _one_line(message: str) -> str:
-    return " ".join(message.split())
+    line = " ".join(message.split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
 class Command(_OneLineErrors, click.Command):  # type: ignore[misc]

@@ -2,12 +2,11 @@
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
+from graspq.common.checksums import DamagedError, checked_lines, read_checked_lines
 from graspq.common.files import write_text
 
 
@@ -50,8 +49,8 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def write_jsonl(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows as JSON, one a line, atomically."""
-    write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+    """Write rows as JSON, one a line with its checksum, atomically."""
+    write_text(path, checked_lines(rows))
 
 
 def read_jsonl(path: Path, columns: Iterable[str], command: str, what: str) -> list[dict[str, Any]]:
@@ -64,15 +63,12 @@ def read_jsonl(path: Path, columns: Iterable[str], command: str, what: str) -> l
         what: what the file should be, for the message, such as `"the table of a sweep"`.
 
     Raises:
-        UserError: the file is missing or unreadable, or a row lacks a column.
+        DamagedError: the file is missing or damaged, or a row lacks a column.
     """
-    try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        lacking = next((name for row in rows for name in columns if name not in row), None)
-    except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"{path}: not a readable table of {command} ({error}); run {command} again") from None
+    rows = read_checked_lines(path, f"table of {command}", f"run {command} again")
+    lacking = next((name for row in rows for name in columns if name not in row), None)
     if lacking is not None:
-        raise UserError(f"{path}: not {what} ({lacking!r} is missing); run {command} again")
+        raise DamagedError(f"{path}: not {what} ({lacking!r} is missing); run {command} again")
     return rows
 
 

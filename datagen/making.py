@@ -21,13 +21,14 @@ from graspq.datagen.settings import DatagenSettings
 from graspq.datagen.shards import (
     BYTES_PER_GRASP,
     GRASPS_PER_SECOND_AND_CORE,
-    Shard,
     check_disk,
     episodes_of,
     missing_shards,
     plan_shards,
 )
+from graspq.datagen.shards import Shard as PlannedShard
 from graspq.datasets.card import write_card
+from graspq.datasets.dataset import Shard
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, require_same
 from graspq.datasets.writer import commit_shard, remove_leftovers, write_shard
@@ -40,7 +41,7 @@ OTHERWISE = "use the same, or another --out"
 
 
 def make_dataset(settings: DatagenSettings) -> Manifest:
-    """Collect what is missing of a dataset and return its manifest.
+    """Collect what is missing of a dataset, or damaged in it, and return its manifest.
 
     Raises:
         UserError: the folder holds something else, cannot be written to, or another process collects into it; the
@@ -55,7 +56,8 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     plan = plan_shards(settings.collection(), settings.size)
     if existing is not None:
         require_same(folder, existing, fresh, OTHERWISE)
-        if not missing_shards(plan, existing) and existing.files:
+        complete = not missing_shards(plan, existing) and existing.files
+        if complete and not _damaged(folder, existing, plan):
             click.echo(f"{folder} is complete: {existing.episodes:,} grasps, {bytes_text(existing.bytes)}")
             return existing
     draw_check(task, objects, settings)
@@ -63,7 +65,10 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
     with locked(folder, "grasp-datagen"):
         manifest = _existing(folder) or fresh
         require_same(folder, manifest, fresh, OTHERWISE)
-        missing = missing_shards(plan, manifest)
+        damaged = _damaged(folder, manifest, plan)
+        for reason in damaged.values():
+            click.echo(f"{reason}; it is made again", err=True)
+        missing = missing_shards(plan, manifest, damaged)
         _announce(settings, folder, missing)
         remove_leftovers(folder)
         objects.copy_to(folder / "objects")
@@ -79,6 +84,27 @@ def make_dataset(settings: DatagenSettings) -> Manifest:
 
 def _existing(folder: Path) -> Manifest | None:
     return Manifest.load(folder) if (folder / MANIFEST_NAME).is_file() else None
+
+
+def _damaged(folder: Path, manifest: Manifest, plan: list[PlannedShard]) -> dict[int, str]:
+    """Return first block -> fault of the listed shards that are not as they were written; they are made again.
+
+    Raises:
+        UserError: one is longer than the plan would make it again.
+    """
+    planned, found = {shard[0].number: episodes_of([shard]) for shard in plan}, dict[int, str]()
+    for entry in manifest.shards:
+        shard = Shard(folder, manifest, entry)
+        try:
+            for path in (shard.steps, shard.episodes):
+                shard.check(path)
+        except UserError as error:
+            reason = error.message.partition("; ")[0]
+            if planned.get(entry.first_block, 0) < entry.episodes:
+                size = entry.first_block * manifest.block_size + entry.episodes
+                raise UserError(f"{reason}; ask for {size:,} grasps or more to make it again") from None
+            found[entry.first_block] = reason
+    return found
 
 
 def describe(settings: DatagenSettings, task: Task, objects: ObjectSet) -> Manifest:
@@ -130,7 +156,7 @@ def _check_space(settings: DatagenSettings, folder: Path, existing: Manifest | N
     check_disk(place, max(0, settings.size - (existing.episodes if existing is not None else 0)))
 
 
-def _announce(settings: DatagenSettings, folder: Path, missing: list[Shard]) -> None:
+def _announce(settings: DatagenSettings, folder: Path, missing: list[PlannedShard]) -> None:
     grasps = episodes_of(missing)
     workers = settings.workers if settings.workers is not None else available_cores()
     seconds = grasps / (GRASPS_PER_SECOND_AND_CORE * max(1, min(workers, available_cores())))
@@ -142,7 +168,9 @@ def _announce(settings: DatagenSettings, folder: Path, missing: list[Shard]) -> 
     )
 
 
-def _collect(settings: DatagenSettings, folder: Path, task: Task, manifest: Manifest, missing: list[Shard]) -> Manifest:
+def _collect(
+    settings: DatagenSettings, folder: Path, task: Task, manifest: Manifest, missing: list[PlannedShard]
+) -> Manifest:
     collection = Collection(task.settings.to_json(), folder / "objects", settings.collection())
     shard_of = {block: shard for shard in missing for block in shard}
     waiting: dict[int, list[Episode]] = {}

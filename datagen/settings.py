@@ -16,7 +16,9 @@ BLOCKS_PER_SHARD = 50
 class DatagenSettings(EngineSettings):
     """Options of `grasp-datagen`."""
 
-    task: str = setting("regular", help="task to collect: regular, targeted, or your own as module:task")
+    task: str = setting(
+        "regular", help="task to collect: regular, targeted, or your own as module:task, whose code is run"
+    )
     size: int = setting(
         10_000, help="number of grasps, such as 2500, 10k, 100k or 1M", parse=parse_count, metavar="COUNT", minimum=1
     )

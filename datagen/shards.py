@@ -1,7 +1,7 @@
 """Which shards a dataset of a given size has, which of them are missing, and what that will cost."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 from graspq.common.errors import UserError
@@ -33,12 +33,17 @@ def plan_shards(settings: CollectionSettings, size: int) -> list[Shard]:
     return [tuple(blocks[first : first + per_shard]) for first in range(0, len(blocks), per_shard)]
 
 
-def missing_shards(plan: Sequence[Shard], manifest: Manifest) -> list[Shard]:
-    """Return the shards of the plan that the manifest does not list in that length yet.
+def missing_shards(plan: Sequence[Shard], manifest: Manifest, damaged: Container[int] = ()) -> list[Shard]:
+    """Return the shards of the plan that the manifest does not list in that length yet, or that are damaged.
 
     A listed shard that is at least as long stays: a folder never shrinks.
+
+    Args:
+        plan: all shards.
+        manifest: of the dataset.
+        damaged: first blocks of shards that are to be made again.
     """
-    have = {entry.first_block: entry.episodes for entry in manifest.shards}
+    have = {entry.first_block: entry.episodes for entry in manifest.shards if entry.first_block not in damaged}
     return [shard for shard in plan if have.get(shard[0].number, 0) < episodes_of([shard])]
 
 

@@ -105,7 +105,8 @@ def readable(what: object) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+    # What a file holds that no command wrote leads to whichever of these.
+    except (OSError, pa.ArrowException, LookupError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise UserError(f"{what} cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
 
 

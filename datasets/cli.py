@@ -28,7 +28,9 @@ class VerifySettings(Settings):
     """Settings of `grasp-data verify`."""
 
     path: Path = setting(help="dataset folder", positional=True, metavar="PATH")
-    workers: int | None = setting(None, help="Processes; all cores if not given, 0 for this one.", minimum=0)
+    workers: int | None = setting(
+        None, help="Processes; all cores if not given, 0 for this one.", minimum=0, maximum=4096
+    )
 
 
 @dataclass(frozen=True)

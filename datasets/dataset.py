@@ -1,6 +1,7 @@
 """Opens datasets as a pool of shards, checking every file against its manifest before anything is read from it."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,11 +12,15 @@ import pyarrow.parquet as pq
 
 from graspq.common.errors import UserError
 from graspq.common.files import sha256_of
+from graspq.common.text import bytes_text
 from graspq.datasets.blocks import REMEDY, BlockRef, read_episode_rows, readable
+from graspq.datasets.columns import record_dtype
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry, episodes_file, steps_file
 from graspq.datasets.pool import ShardPool
+from graspq.datasets.tables import episodes_schema, steps_schema
 
 HASHING_THREADS = 4
+LARGEST_BLOCK = 4 * 10**9  # bytes in memory
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,13 @@ class Shard:
             UserError: the file is missing or damaged.
         """
         self.check(self.episodes, verify)
+        with readable(f"{self.episodes}:"):
+            footer = pq.read_metadata(self.episodes)
+        if footer.num_rows != self.entry.episodes:
+            raise UserError(
+                f"{self.episodes}: expected {self.entry.episodes} episodes, got {footer.num_rows}; {REMEDY}"
+            )
+        _check_columns(self.episodes, footer.schema.to_arrow_schema(), episodes_schema(self.manifest))
         return read_episode_rows(self.episodes)
 
     def footer(self) -> Any:
@@ -93,7 +105,20 @@ class Shard:
                 f"{self.steps}: expected {self.entry.blocks} blocks with {self.entry.rows} rows, "
                 f"got {footer.num_row_groups} with {footer.num_rows}; {REMEDY}"
             )
+        _check_columns(self.steps, footer.schema.to_arrow_schema(), steps_schema(self.manifest))
+        self._check_blocks(footer)
         return footer
+
+    def _check_blocks(self, footer: Any) -> None:
+        """Refuse blocks that no memory holds, whatever the manifest says, before one is read."""
+        manifest, rows = self.manifest, [footer.row_group(index).num_rows for index in range(footer.num_row_groups)]
+        most = manifest.block_size * int(manifest.task["max_steps"])
+        row_bytes = math.prod(manifest.image_shape) + record_dtype(manifest.image_shape, manifest.action).itemsize
+        if max(rows) > most or max(rows) * row_bytes > LARGEST_BLOCK:
+            raise UserError(
+                f"{self.steps}: a block of {max(rows):,} rows ({bytes_text(max(rows) * row_bytes)}), expected at most "
+                f"{most:,} and {bytes_text(LARGEST_BLOCK)}; {REMEDY}"
+            )
 
     def blocks(self, footer: Any) -> list[BlockRef]:
         """Return where its blocks are."""
@@ -109,6 +134,14 @@ class Shard:
             )
             for index, block in enumerate(self.entry.block_range)
         ]
+
+
+def _check_columns(path: Path, found: Any, expected: Any) -> None:
+    for field in expected:
+        index = found.get_field_index(field.name)
+        if index < 0 or not found.field(index).equals(field):
+            there = found.field(index) if index >= 0 else "missing"
+            raise UserError(f"{path}: column {field.name}: expected {field}, got {there}; {REMEDY}")
 
 
 def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPool:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from graspq.common.action_space import ActionSpace, grasping
@@ -17,6 +17,8 @@ from graspq.common.files import read_json, write_json
 
 FORMAT_VERSION = 2
 READABLE = (1, 2)
+MOST = 10**15  # of anything that is counted
+LARGEST_IMAGE = 4096
 MANIFEST_NAME = "manifest.json"
 SHARD_NAME = re.compile(r"blocks-\d{6,}-\d{6,}(-short-\d+)?")
 DECIDING = ("format_version", "task", "settings", "object_set", "discount", "versions")
@@ -72,6 +74,14 @@ class ShardEntry:
         expected = {steps_file(self.name), episodes_file(self.name)}
         if SHARD_NAME.fullmatch(self.name) is None or set(self.files) != expected or set(self.sizes) != expected:
             raise ValueError(f"shard {self.name!r}: expected the files {sorted(expected)}")
+        counts = (self.first_block, self.blocks, self.episodes, self.rows, self.successes, *self.sizes.values())
+        if not all(type(count) is int and 0 <= count <= MOST for count in counts):
+            raise ValueError(f"shard {self.name}: expected whole numbers of 0 to {MOST:.0e}, got {counts}")
+        if len(self.seeds) != 2 or not all(type(seed) is int for seed in self.seeds):
+            raise ValueError(f"shard {self.name}: expected two seeds, got {self.seeds}")
+        # A block takes bytes in the footer of its file, so that no more of them are believed in than can be there.
+        if not 1 <= self.blocks <= min(self.episodes, self.sizes[steps_file(self.name)]) or self.rows < self.episodes:
+            raise ValueError(f"shard {self.name}: {self.blocks} blocks of {self.episodes} episodes, {self.rows} rows")
 
     @property
     def bytes(self) -> int:
@@ -117,6 +127,7 @@ class Manifest:
     tells_action: bool = True
 
     def __post_init__(self) -> None:
+        _check_kinds(self)
         following = 0
         for entry in self.shards:
             if entry.first_block < following:
@@ -197,21 +208,23 @@ class Manifest:
         values = read_json(path, "dataset manifest")
         if not isinstance(values, dict) or "format_version" not in values:
             raise UserError(f"{path}: not a dataset manifest; {REMEDY}")
-        if values["format_version"] not in READABLE and values.get("digest") == _digest_of(values):
-            found, expected = values["format_version"], " or ".join(map(str, READABLE))
-            raise UserError(f"{path}: format version {found}, expected {expected}; use another graspq")
-        return cls._checked(path, values)
+        try:
+            return cls._checked(path, values)
+        except UserError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+            raise UserError(f"{path}: not a dataset manifest of this version ({error}); {REMEDY}") from None
 
     @classmethod
     def _checked(cls, path: Path, values: dict[str, Any]) -> "Manifest":
+        if values["format_version"] not in READABLE and values.get("digest") == _digest_of(values):
+            found, expected = values["format_version"], " or ".join(map(str, READABLE))
+            raise UserError(f"{path}: format version {found}, expected {expected}; use another graspq")
         # The bytes are compared, not only the content, so that no flipped bit passes, not even one in white space.
         rendered = json.dumps(values, indent=2, ensure_ascii=False, allow_nan=True) + "\n"
         if values.get("digest") != _digest_of(values) or path.read_bytes() != rendered.encode():
             raise UserError(f"{path}: damaged or edited, its content does not match its own digest; {REMEDY}")
-        try:
-            return cls.from_json({name: value for name, value in values.items() if name != "digest"})
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{path}: not a dataset manifest of this version ({error}); {REMEDY}") from None
+        return cls.from_json({name: value for name, value in values.items() if name != "digest"})
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Manifest":
@@ -241,6 +254,41 @@ class Manifest:
         return dataclasses.replace(self, shards=tuple(shards))
 
 
+def _check_kinds(manifest: Manifest) -> None:
+    """Refuse what no command writes, before anything is allocated or opened by it.
+
+    Raises:
+        ValueError: naming the first entry that is not as expected.
+    """
+    task, settings, shape, limits = manifest.task, manifest.settings, manifest.image_shape, manifest.phi_range
+    dicts = (task, settings, manifest.versions, manifest.object_set, manifest.files)
+    expected = {
+        "objects for task, settings, versions, object_set and files": all(isinstance(one, dict) for one in dicts),
+        "a name of the task": isinstance(task, dict) and isinstance(task.get("name"), str),
+        "max_steps of 1 to 10,000": isinstance(task, dict) and _whole(task.get("max_steps"), 1, 10_000),
+        "a block_size of 1 to 100,000": isinstance(settings, dict) and _whole(settings.get("block_size"), 1, 100_000),
+        f"an image_shape of three, each 1 to {LARGEST_IMAGE}": len(shape) == 3
+        and all(_whole(size, 1, LARGEST_IMAGE) for size in shape),
+        "a discount of 0 to 1": isinstance(manifest.discount, int | float) and 0 <= manifest.discount <= 1,
+        "no phi_range, or two numbers": limits is None
+        or (len(limits) == 2 and all(isinstance(one, int | float) for one in limits)),
+        "files inside the dataset with their digests": isinstance(manifest.files, dict)
+        and all(_inside(path) and isinstance(digest, str) for path, digest in manifest.files.items()),
+    }
+    wrong = next((what for what, right in expected.items() if not right), None)
+    if wrong is not None:
+        raise ValueError(f"expected {wrong}")
+
+
+def _whole(value: Any, least: int, most: int) -> bool:
+    return type(value) is int and least <= value <= most
+
+
+def _inside(path: str) -> bool:
+    parts = PurePosixPath(path)
+    return not parts.is_absolute() and ".." not in parts.parts and "\0" not in path
+
+
 def require_same(folder: Path, existing: Manifest, fresh: Manifest, way_out: str) -> None:
     """Refuse to add to a dataset that was made otherwise; see `refuse_other`."""
     theirs, ours = ({name: getattr(one, name) for name in DECIDING} for one in (existing, fresh))
@@ -249,4 +297,5 @@ def require_same(folder: Path, existing: Manifest, fresh: Manifest, way_out: str
 
 def _digest_of(values: dict[str, Any]) -> str:
     content = {name: value for name, value in values.items() if name != "digest"}
-    return hashlib.sha256(json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()).hexdigest()
+    rendered = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return hashlib.sha256(rendered.encode()).hexdigest()

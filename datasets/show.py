@@ -6,6 +6,7 @@ One row is one episode, one column one step; green rows succeeded.
 from collections.abc import Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -60,6 +61,7 @@ def choose_episodes(folder: Path, count: int, seed: int, success: bool | None = 
     return [open_shards([path])[number] for _, path, number in sorted(chosen)]
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are names, whatever they hold
 def save_strips(path: Path, episodes: Sequence[Episode], manifest: Manifest, title: str) -> None:
     """Draw the strips and write them to `path` as PNG.
 

@@ -23,6 +23,7 @@ from graspq.datasets.tables import episodes_schema, steps_schema
 from graspq.engine import EngineSettings, Place, run
 
 OBJECT_SET = "objects/object_set.json"
+CHECKSUM = f"{OBJECT_SET}.sha256"
 Progress = Callable[[int], Any]
 
 
@@ -125,7 +126,7 @@ def _checked(path: Path, digest: str) -> Iterator[str]:
 
 def _belonging(folder: Path, manifest: Manifest) -> set[str]:
     shards = {path for entry in manifest.shards for path in entry.files}
-    return {MANIFEST_NAME, OBJECT_SET, *manifest.files, *shards, *_object_digests(folder)}
+    return {MANIFEST_NAME, OBJECT_SET, CHECKSUM, *manifest.files, *shards, *_object_digests(folder)}
 
 
 def _others(folder: Path, belonging: set[str]) -> list[str]:
@@ -145,16 +146,19 @@ def _faults(shard: Shard) -> Iterator[str]:
     if intact:
         try:
             yield from _content(shard)
-        except (UserError, OSError, pa.ArrowException, KeyError, ValueError) as error:
+        except (UserError, OSError, pa.ArrowException, LookupError, ValueError, TypeError) as error:
             yield f"{shard.steps}: not the tables expected ({error})"
 
 
 def _where(shard: Shard) -> str:
     """Say which blocks of a damaged steps table fail their page checksums."""
     failed = []
+    if not shard.steps.is_file():
+        return ""
     try:
         with pq.ParquetFile(shard.steps, page_checksum_verification=True) as file:
-            for index, block in enumerate(shard.entry.block_range):
+            blocks = shard.entry.block_range[: file.num_row_groups]
+            for index, block in enumerate(blocks):
                 try:
                     file.read_row_group(index, use_threads=False)
                 except (OSError, pa.ArrowException):

@@ -133,7 +133,7 @@ def _write(path: Path, content: pa.Buffer, groups: list[pa.Table], total: int) -
         raise _explained(error, path, total) from error
 
 
-def _explained(error: OSError, path: Path, total: int) -> Exception:
+def _explained(error: OSError, path: Path, total: int) -> UserError:
     folder = path.parent.parent
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return UserError(
@@ -142,4 +142,6 @@ def _explained(error: OSError, path: Path, total: int) -> Exception:
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return UserError(f"{folder}: cannot write here ({error.strerror}); choose another folder or change its rights")
-    return error
+    return UserError(
+        f"{path}: cannot be written ({error.strerror}); finished shards are kept, run the same command again"
+    )

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+from graspq.common.checksums import read_checked_json
 from graspq.common.errors import MachineError, UserError, failure_of_machine, refuse_other
-from graspq.common.files import read_json
 
 PLAN_FILE = "plan.json"
 
@@ -139,7 +139,7 @@ def older_units(
     path = folder / PLAN_FILE
     if not path.exists():
         return []
-    older = read_json(path, f"plan of a {what}")
+    older = read_checked_json(path, f"plan of a {what}", "choose another --out, or delete it to plan anew")
     try:
         theirs, ours = ({name: one[name] for name in ("format_version", *fixed)} for one in (older, shared))
         refuse_other(folder, f"a {what}", theirs, ours, "choose another --out")

@@ -21,7 +21,7 @@ class EngineSettings(Settings):
         help="Ray cluster that is there: an address, or auto; a Ray of this machine's own is started where not given.",
     )
     workers: int | None = setting(
-        None, help="Number of workers; all cores where not given, 0 for this process itself.", minimum=0
+        None, help="Number of workers; all cores where not given, 0 for this process itself.", minimum=0, maximum=4096
     )
 
     def __post_init__(self) -> None:

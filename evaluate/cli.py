@@ -36,6 +36,9 @@ def main(settings: EvalSettings) -> int:
     folder with eval.json, episodes.jsonl and films.npz; several jobs also give one table, results.jsonl and
     results.csv. A job that is finished is not run again.
 
+    A module that is named, here or in the files of a run or of its data, is imported: its code is run. A run that names
+    none (no : in algo, network and task of its config.json) runs no code of its maker.
+
     \b
     Examples:
       grasp-eval runs/mc --episodes 1000

@@ -24,10 +24,10 @@ from graspq.evaluate.jobs import Job
 from graspq.evaluate.records import (
     ACTOR,
     CEM,
-    EPISODES_FILE,
     FORMAT_VERSION,
     EpisodeRow,
     Evaluation,
+    finished_in,
     identity_digest,
     write_rows,
     write_summary,
@@ -73,7 +73,7 @@ class Prepared:
     @property
     def finished(self) -> Evaluation | None:
         """The evaluation, if it is there and whole."""
-        return _evaluation_in(self.folder)
+        return finished_in(self.folder)
 
     @property
     def task(self) -> Task:
@@ -185,17 +185,9 @@ def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any], take
     else:
         parent = job.run / "evaluations"
     first = parent / name
-    found = _evaluation_in(first)
+    found = finished_in(first)
     free = first not in taken if found is None else found.summary["job"] == identity
     return first if free else parent / f"{name}-{identity_digest(identity)[:8]}"
-
-
-def _evaluation_in(folder: Path) -> Evaluation | None:
-    try:
-        found = Evaluation.load(folder)
-    except UserError:
-        return None
-    return found if found.has(EPISODES_FILE) else None
 
 
 def run_prepared(

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from graspq.common.errors import UserError
+from graspq.common.checksums import DamagedError
 from graspq.common.files import committed
-from graspq.evaluate.records import FILMS_FILE, EpisodeRow, Evaluation
+from graspq.evaluate.records import EVAL_FILE, FILMS_FILE, REMEDY, EpisodeRow, Evaluation
 
 
 @dataclass(frozen=True)
@@ -78,16 +78,18 @@ def read_films(evaluation: Evaluation) -> list[Film]:
     """Return the films of an evaluation; none if it kept none.
 
     Raises:
-        UserError: the file is damaged.
+        DamagedError: the file is not as it was written.
     """
     path = evaluation.folder / FILMS_FILE
-    if not evaluation.has(FILMS_FILE):
+    if not path.is_file() or not evaluation.names(FILMS_FILE):
         return []
+    if not evaluation.has(FILMS_FILE):
+        raise DamagedError(f"{path}: damaged, its SHA-256 is not the one in {EVAL_FILE}; {REMEDY}")
     try:
         with np.load(path, allow_pickle=False) as stored:
             frames, episodes, lengths = stored["frames"], stored["episodes"], stored["lengths"]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: not the films of an evaluation ({error}); run grasp-eval --again") from None
+        raise DamagedError(f"{path}: not the films of an evaluation ({error}); {REMEDY}") from None
     rows = {row.episode: row for row in evaluation.rows()}
     ends = np.cumsum(lengths)
     return [

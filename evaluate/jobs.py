@@ -5,6 +5,7 @@ A job is one policy, task, split, object set, seed and number of episodes; a fil
 
 import glob
 import itertools
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from graspq.common.errors import UserError
 from graspq.common.files import read_toml
+from graspq.common.options import MOST
 from graspq.evaluate.records import ORACLE, RANDOM
 from graspq.evaluate.settings import EvalSettings
 from graspq.train.search_settings import CemSettings
@@ -19,6 +21,7 @@ from graspq.train.search_settings import CemSettings
 LISTS = ("runs", "policies", "tasks", "splits", "objects", "seeds")
 SINGLES = ("episodes", "checkpoint", "cem")
 RUN_FILE = "config.json"
+MOST_JOBS = 100_000
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,12 @@ def _product(table: dict[str, Any], settings: EvalSettings) -> list[Job]:
     cem = CemSettings.from_json({**settings.cem.to_json(), **table.get("cem", {})})
     episodes, step = (table.get(name, getattr(settings, name)) for name in ("episodes", "checkpoint"))
     objects = [Path(folder) for folder in table["objects"]] if "objects" in table else [settings.objects]
+    if any(isinstance(one, int) and one > MOST for one in (episodes, step)):
+        raise UserError(f"episodes = {episodes}, checkpoint = {step}: expected at most {MOST:,}")
     tasks, splits, seeds = (table.get(f"{name}s", [getattr(settings, name)]) for name in ("task", "split", "seed"))
+    count = math.prod(map(len, (tasks, splits, objects, seeds, players)))
+    if count > MOST_JOBS:
+        raise UserError(f"{count:,} jobs; expected at most {MOST_JOBS:,}")
     return [
         Job(run, policy, task, split, seed, episodes, folder, step if run is not None else None, cem)
         for task, split, folder, seed, (run, policy) in itertools.product(tasks, splits, objects, seeds, players)

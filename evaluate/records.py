@@ -1,25 +1,57 @@
 """The files of one evaluation: `episodes.jsonl` (a row per episode), `films.npz` (some frames) and `eval.json`.
 
-`eval.json` is written last and holds the digests of the others: an evaluation without it, or with other files than
-it names, does not count as finished.
+`eval.json` is written last and holds the digests of the others and its own checksum: an evaluation without it, or with
+other files than it names, does not count as finished.
 """
 
+import functools
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
-from graspq.common.files import read_json, sha256_of, write_json, write_text
+import click
+
+from graspq.common.checksums import DamagedError, read_checked_json, write_checked_json
+from graspq.common.errors import MachineError, UserError
+from graspq.common.files import sha256_of, write_text
+from graspq.common.options import MOST
 
 EVAL_FILE = "eval.json"
 EPISODES_FILE = "episodes.jsonl"
 FILMS_FILE = "films.npz"
 FORMAT_VERSION = 2
+REMEDY = "run grasp-eval --again"
 # What eval.json calls policies: the two ends of the scale, and those of runs.
 ORACLE, RANDOM, CEM, ACTOR = "oracle", "random", "cem", "actor"
+
+
+def _words(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _share(value: Any) -> bool:
+    return type(value) in (int, float) and 0 <= value <= 1
+
+
+def _count(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= MOST
+
+
+def _entries(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+# What eval.json holds, as far as tables and reports reckon with it, and what each must be.
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "task": _words, "split": _words, "label": _words, "seed": lambda value: type(value) is int,
+    "policy": lambda value: value is None or _words(value), "successes": _count, "success_rate": _share,
+    "episodes": lambda value: _count(value) and value > 0, "job": _entries, "files": _entries, "object_set": _entries,
+    "ci95": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_share, value)),
+    "mean_steps": lambda value: type(value) in (int, float), "versions": _entries,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,33 +120,46 @@ class Evaluation:
 
         Raises:
             UserError: it is missing or is no evaluation of this format.
+            DamagedError: it is not as it was written.
         """
         path = folder / EVAL_FILE
-        summary = read_json(path, "evaluation")
+        summary = read_checked_json(path, "evaluation", REMEDY)
         needed = ("format_version", "task", "split", "episodes", "successes", "success_rate", "ci95", "label", "job")
-        missing = [name for name in needed if not isinstance(summary, dict) or name not in summary]
+        missing = [name for name in needed if name not in summary]
         if missing:
             raise UserError(f"{path}: no evaluation of graspq ({missing[0]!r} is missing); run grasp-eval again")
         if summary["format_version"] != FORMAT_VERSION:
             found = summary["format_version"]
             raise UserError(f"{path}: format {found}, expected {FORMAT_VERSION}; run grasp-eval again")
+        wrong = next((name for name, fits in _KINDS.items() if name in summary and not fits(summary[name])), None)
+        if wrong is None and not summary["successes"] <= summary["episodes"]:
+            wrong = "successes"
+        if wrong is not None:
+            raise DamagedError(f"{path}: {wrong} = {summary[wrong]!r} is none of an evaluation; {REMEDY}")
         return cls(folder, summary)
 
     def rows(self) -> list[EpisodeRow]:
         """Read the rows of all episodes, in the order of their index.
 
         Raises:
-            UserError: the file is missing or is not the one that `eval.json` names.
+            DamagedError: the file is missing or is not the one that `eval.json` names.
         """
         path = self.folder / EPISODES_FILE
         if not self.has(EPISODES_FILE):
-            raise UserError(f"{path}: not the rows of this evaluation; run grasp-eval --again")
-        return [EpisodeRow.from_json(json.loads(line)) for line in path.read_text().splitlines()]
+            raise DamagedError(f"{path}: damaged or missing, not the rows that {EVAL_FILE} names; {REMEDY}")
+        try:
+            return [EpisodeRow.from_json(json.loads(line)) for line in path.read_text().splitlines()]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise DamagedError(f"{path}: not the rows of an evaluation ({error!r}); {REMEDY}") from None
+
+    def names(self, name: str) -> bool:
+        """Return whether `eval.json` names a file `name` beside it."""
+        return name in self.summary.get("files", {})
 
     def has(self, name: str) -> bool:
         """Return whether the file `name` stands beside `eval.json` as it was written."""
         path = self.folder / name
-        return path.is_file() and self.summary.get("files", {}).get(name) == sha256_of(path)
+        return self.names(name) and path.is_file() and self.summary["files"][name] == sha256_of(path)
 
 
 def write_rows(folder: Path, rows: Sequence[EpisodeRow]) -> None:
@@ -126,7 +171,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> Evaluation:
     """Write `eval.json` with the digests of the files beside it; call it last."""
     names = [name for name in (EPISODES_FILE, FILMS_FILE) if (folder / name).is_file()]
     complete = {**summary, "files": {name: sha256_of(folder / name) for name in names}}
-    write_json(folder / EVAL_FILE, complete)
+    write_checked_json(folder / EVAL_FILE, complete)
     return Evaluation(folder, complete)
 
 
@@ -136,11 +181,45 @@ def identity_digest(identity: dict[str, Any]) -> str:
 
 
 def find_evaluations(folder: Path) -> list[Evaluation]:
-    """Return all evaluations at or below `folder`, in the order of their paths; broken ones are left out."""
+    """Return all evaluations at or below `folder`, in the order of their paths; those of other formats are left out.
+
+    Raises:
+        DamagedError: an `eval.json` is not as it was written.
+    """
     found = []
     for path in sorted(folder.rglob(EVAL_FILE)):
         try:
             found.append(Evaluation.load(path.parent))
+        except (DamagedError, MachineError):
+            raise
         except UserError:
             continue
     return found
+
+
+def finished_in(folder: Path) -> Evaluation | None:
+    """Return the evaluation in a folder if it is there and finished; says so where it is there and damaged."""
+    try:
+        found = Evaluation.load(folder)
+        found.rows()
+    except MachineError:
+        raise
+    except DamagedError as error:
+        _say_once(f"{error.message.partition('; ')[0]}: does not count as finished")
+        return None
+    except UserError:
+        return None
+    return found
+
+
+@functools.cache
+def _say_once(line: str) -> None:
+    click.echo(line, err=True)
+
+
+def finished_below(folder: Path) -> Iterator[Evaluation]:
+    """Yield all finished evaluations at or below `folder`, in the order of their paths; see `finished_in`."""
+    for path in sorted(folder.rglob(EVAL_FILE)):
+        found = finished_in(path.parent)
+        if found is not None:
+            yield found

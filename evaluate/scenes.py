@@ -129,7 +129,11 @@ def _dataset_folders(shards: Iterable[str]) -> Iterator[Path]:
     for pattern in shards:
         path = Path(pattern)
         anchor = Path(path.anchor)
-        for match in [path] if path.exists() else sorted(anchor.glob(str(path.relative_to(anchor)))):
+        try:
+            matches = [path] if path.exists() else sorted(anchor.glob(str(path.relative_to(anchor))))
+        except (OSError, ValueError, NotImplementedError):  # no path: the data are not here
+            continue
+        for match in matches:
             yield from (
                 folder for folder in (match, *list(match.absolute().parents)[:2]) if (folder / MANIFEST_NAME).is_file()
             )

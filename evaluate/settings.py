@@ -17,7 +17,8 @@ class EvalSettings(CemOptions, EngineSettings):
 
     runs: tuple[str, ...] = setting((), help="Run folders, or globs of them.", positional=True, metavar="[RUN]...")
     policy: tuple[str, ...] = setting(
-        (), help="Score also this policy: random, oracle or your own as module:factory. May be repeated."
+        (),
+        help="Score also this policy: random, oracle or module:factory, whose code is run. May be repeated.",
     )
     task: str | None = setting(
         None,

@@ -9,6 +9,7 @@ import json
 import math
 import re
 import shutil
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ from graspq.common.errors import UserError
 from graspq.common.files import read_json, sha256_of
 from graspq.objects.mesh_files import read_obj_parts, urdf_text
 from graspq.objects.model import Color
-from graspq.objects.publishing import MANIFEST, published
+from graspq.objects.publishing import CHECKSUM, MANIFEST, checksum_text, published
 
 FORMAT_VERSION = 1
-_PLAIN_NAME = re.compile(r"\w[\w.-]*", re.ASCII)
+_PLAIN_NAME = re.compile(r"\w[\w.-]{0,199}", re.ASCII)
+LARGEST = 1000.0  # metres and kilograms, and powers of them: far beyond what a gripper meets
 
 
 def mesh_file(object_id: str) -> str:
@@ -82,7 +84,8 @@ class ObjectRecord:
             raise ValueError(f"object_id {record.object_id!r}: expected letters, digits, '_', '.' and '-'")
         # A set names no files but its own.
         files = mesh_file(record.object_id), urdf_file(record.object_id)
-        if (record.mesh, record.urdf) != files or set(record.sha256) != set(files):
+        digests = record.sha256 if isinstance(record.sha256, dict) else {}
+        if (record.mesh, record.urdf) != files or set(digests) != set(files):
             raise ValueError(f"{record.object_id}: expected the files {files[0]} and {files[1]}")
         positive = (record.mass, record.volume, *record.inertia, *record.extents)
         numbers = (*positive, *record.color)
@@ -90,8 +93,8 @@ class ObjectRecord:
             isinstance(number, int | float) and math.isfinite(number) for number in numbers
         ):
             raise ValueError(f"{record.object_id}: expected finite numbers, three or four where there are several")
-        if min(positive) <= 0 or not all(0 <= share <= 1 for share in record.color):
-            raise ValueError(f"{record.object_id}: expected sizes above 0 and colours of 0 to 1")
+        if not 0 < min(positive) <= max(positive) <= LARGEST or not all(0 <= share <= 1 for share in record.color):
+            raise ValueError(f"{record.object_id}: expected sizes above 0 to {LARGEST:g} and colours of 0 to 1")
         return record
 
 
@@ -125,7 +128,7 @@ class ObjectSet:
             if version == FORMAT_VERSION:
                 objects = tuple(ObjectRecord.from_json(record) for record in values["objects"])
                 origin = str(values["name"]), values["generator_version"], values["seed"]
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise UserError(f"{path}: not a readable object set ({error!r}); make the set again") from None
         if version != FORMAT_VERSION:
             raise UserError(f"{path}: format_version {version!r}, expected {FORMAT_VERSION}; make it again")
@@ -133,8 +136,11 @@ class ObjectSet:
         if not objects or len(loaded._by_id) != len(objects):
             raise UserError(f"{path}: expected one or more objects with ids of their own; make the set again")
         files = (file for record in objects for file in record.sha256)
-        if any((folder / file).is_symlink() for file in ("meshes", *files)):
-            raise UserError(f"{path}: the files of a set lie in its folder, but a link is among them; copy them there")
+        if any(_elsewhere(folder / file) for file in ("meshes", *files)):
+            raise UserError(
+                f"{path}: the files of a set lie in its folder, but a link is among them, or a pipe; copy them there"
+            )
+        _check_own(path)
         return loaded
 
     @functools.cached_property
@@ -236,9 +242,29 @@ class ObjectSet:
             (temporary / "meshes").mkdir()
             for file in (MANIFEST, *(file for record in self.objects for file in record.sha256)):
                 shutil.copyfile(self.folder / file, temporary / file)
+            (temporary / CHECKSUM).write_text(checksum_text((temporary / MANIFEST).read_bytes()))
         copy = ObjectSet.load(folder)
         copy.verify()
         return copy
+
+
+def _elsewhere(path: Path) -> bool:
+    """Return whether a path is there and leads elsewhere: a link, a pipe, a device."""
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+def _check_own(path: Path) -> None:
+    """Check an `object_set.json` against the digest beside it, where there is one."""
+    beside = path.with_name(CHECKSUM)
+    try:
+        if beside.exists() and beside.read_bytes() != checksum_text(path.read_bytes()).encode():
+            raise UserError(f"{path}: damaged or edited, its SHA-256 is not that of {CHECKSUM}; make the set again")
+    except OSError as error:
+        raise _unreadable(beside, error) from None
 
 
 def _unreadable(path: Path, error: OSError) -> UserError:

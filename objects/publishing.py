@@ -1,6 +1,7 @@
 """The folder of an object set: it appears whole or not at all, and nothing that was there is written over."""
 
 import contextlib
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +9,14 @@ from graspq.common.errors import UserError
 from graspq.common.files import committed_folder, sha256_of
 
 MANIFEST = "object_set.json"
+# Beside it, as `sha256sum --check` reads it: its own digest, which other files of a set have in it. A set that an older
+# version made has none.
+CHECKSUM = "object_set.json.sha256"
+
+
+def checksum_text(manifest: bytes) -> str:
+    """Return what stands in `object_set.json.sha256` beside an `object_set.json` of these bytes."""
+    return f"{hashlib.sha256(manifest).hexdigest()}  {MANIFEST}\n"
 
 
 @contextlib.contextmanager
@@ -39,5 +48,7 @@ def _require_same(made: Path, there: Path) -> None:
         raise UserError(f"{there}: holds another object set; choose another folder or remove this one")
     for path in sorted(path for path in made.rglob("*") if path.is_file()):
         twin = there / path.relative_to(made)
+        if path.name == CHECKSUM and not twin.exists():
+            continue
         if not twin.is_file() or sha256_of(path) != sha256_of(twin):
             raise UserError(f"{twin}: missing or damaged; remove {there} and make it again")

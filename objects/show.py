@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import trimesh
 from matplotlib.axes import Axes
@@ -21,6 +22,7 @@ _CELL, _LABEL, _HEAD = 1.55, 0.42, 0.75
 _INK, _PALE = "#22262e", "#6b7280"
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are names, whatever they hold
 def contact_sheet(
     object_set: ObjectSet, out: Path, *, split: str | None = None, count: int | None = None, by_family: int = 0
 ) -> int:

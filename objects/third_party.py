@@ -88,7 +88,8 @@ def _object_files(source: Path) -> dict[str, Path]:
     """Return id → file of each object under `source`, sorted by id."""
     if not source.is_dir():
         raise UserError(f"{source}: no such folder; expected one with OBJ, STL or URDF files")
-    every = sorted(path for path in source.rglob("*") if path.is_file())
+    # A link may lead anywhere: only what lies here is read.
+    every = sorted(path for path in source.rglob("*") if path.is_file() and _lies_in(path, source))
     found = [path for path in every if path.suffix.lower() == ".urdf"]
     found = found or [path for path in every if path.suffix.lower() in _MESH_SUFFIXES]
     if not found:
@@ -101,6 +102,10 @@ def _object_files(source: Path) -> dict[str, Path]:
         twice = next(name for name in names if names.count(name) > 1)
         raise UserError(f"{source}: two files would both be the object {twice!r}; rename one of them")
     return files
+
+
+def _lies_in(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())
 
 
 def _clean(name: str) -> str:

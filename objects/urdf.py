@@ -49,7 +49,8 @@ def read_urdf(path: Path, root: Path) -> Description:
         return Description(meshes, mass if 0 < mass < math.inf else None, _color(links[0], robot))
     except UserError:
         raise
-    except (ElementTree.ParseError, OSError, ValueError) as error:
+    # A LookupError is an encoding that nobody knows.
+    except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
         raise UserError(f"{path}: not a readable URDF ({error}); repair or remove it") from None
 
 

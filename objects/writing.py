@@ -10,7 +10,7 @@ from graspq.common.errors import UserError
 from graspq.objects.mesh_files import obj_text, urdf_text
 from graspq.objects.model import ObjectModel
 from graspq.objects.object_set import ObjectRecord, ObjectSet, manifest_text, mesh_file, urdf_file
-from graspq.objects.publishing import MANIFEST, published
+from graspq.objects.publishing import CHECKSUM, MANIFEST, checksum_text, published
 
 
 def write_object_set(
@@ -42,6 +42,7 @@ def write_object_set(
         records = [_write_object(temporary, model) for model in bar]
         text = manifest_text(name=name, generator_version=generator_version, seed=seed, records=records)
         (temporary / MANIFEST).write_bytes(text.encode())
+        (temporary / CHECKSUM).write_text(checksum_text(text.encode()))
     return ObjectSet.load(folder)
 
 

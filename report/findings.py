@@ -14,8 +14,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graspq.common.errors import UserError
-from graspq.evaluate.records import EVAL_FILE, ORACLE, RANDOM, EpisodeRow, Evaluation, find_evaluations, identity_digest
+from graspq.common.checksums import DamagedError
+from graspq.common.errors import MachineError, UserError
+from graspq.evaluate.records import (
+    EPISODES_FILE,
+    EVAL_FILE,
+    ORACLE,
+    RANDOM,
+    EpisodeRow,
+    Evaluation,
+    find_evaluations,
+    identity_digest,
+)
 from graspq.evaluate.statistics import wilson_interval
 from graspq.report.stability import Sweep, all_left_out, find_sweeps
 from graspq.train.run import Run
@@ -130,10 +140,8 @@ class Score:
         """Return the rows of all episodes; none where they are missing."""
         found: list[EpisodeRow] = []
         for evaluation in self.evaluations:
-            try:
+            if (evaluation.folder / EPISODES_FILE).exists():
                 found += evaluation.rows()
-            except UserError:
-                continue
         return found
 
     @cached_property
@@ -173,6 +181,7 @@ def gather(folders: Sequence[Path], baselines: Path | None) -> Findings:
 
     Raises:
         UserError: a folder is missing, or holds neither a run nor an evaluation.
+        DamagedError: a file of one is not as it was written.
     """
     paths: dict[Path, None] = {}
     evaluations: dict[Path, Evaluation] = {}
@@ -216,6 +225,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _is_run(folder: Path) -> bool:
     try:
         Run.open(folder)
+    except (DamagedError, MachineError):
+        raise
     except UserError:
         return False
     return True

@@ -83,6 +83,18 @@ class TaskSettings(Settings):
     settle_steps: int = 480
     simulator_version: int = SIMULATOR_VERSION
 
+    def __post_init__(self) -> None:
+        """Check all values: settings come from files too.
+
+        Raises:
+            UserError: a number is not finite, or far beyond what can be simulated.
+        """
+        super().__post_init__()
+        for field in dataclasses.fields(self):
+            value, most = getattr(self, field.name), 4096 if field.name == "image_size" else 1_000_000
+            if not isinstance(value, str) and not -most <= value <= most:
+                raise UserError(f"task {self.name}: {field.name} = {value}, expected at most {most:,}")
+
     @property
     def action_limits(self) -> tuple[float, float, float, float]:
         """Displacement of an action of ones: metres, metres, metres, radians."""
@@ -239,7 +251,9 @@ def task_from_json(values: dict[str, Any]) -> Task:
     Raises:
         UserError: there is no such task here, or it was simulated by another version of the simulator.
     """
-    task = task_named(str(values["name"]))
+    if not isinstance(values.get("name"), str):
+        raise UserError(f"task {values!r}: expected a name; make the data again")
+    task = task_named(values["name"])
     settings = type(task.settings).from_json(values)
     if settings.simulator_version != SIMULATOR_VERSION:
         raise UserError(

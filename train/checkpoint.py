@@ -6,16 +6,19 @@ A checkpoint is a folder `step-00000500` with one file for each network and opti
 import dataclasses
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+import click
 import safetensors.torch
 import torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from graspq.common.errors import UserError
-from graspq.common.files import committed_folder, read_json
+from graspq.common.checksums import DamagedError
+from graspq.common.errors import MachineError, UserError
+from graspq.common.files import committed_folder, content_of, read_json
 from graspq.train.estimators import estimator_named
 from graspq.train.networks import build
 from graspq.train.networks.network import NetworkSpecification
@@ -24,6 +27,7 @@ from graspq.train.state import TrainState
 
 FORMAT = 3
 KEPT = "kept"
+_PLAIN_FILE = re.compile(r"\w[\w-]*\.safetensors", re.ASCII)
 STATE_FILE = "state.json"
 REMEDY = "copy it again, or delete this checkpoint's folder to go on from the one before it"
 
@@ -128,7 +132,10 @@ def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
             f"{checkpoint}: of another network than its run: config.json says {run.config.get('network')}, "
             f"the checkpoint {description['network']}; copy the run again"
         )
-    makers = estimator_named(run.config["settings"]["algo"]).parts
+    algo = run.config["settings"].get("algo")
+    if not isinstance(algo, str):
+        raise UserError(f"{run.folder / 'config.json'}: names no estimator (settings.algo); copy the run again")
+    makers = estimator_named(algo).parts
     networks: dict[str, nn.Module] = {}
     names = []
     for part in description["parts"]:
@@ -151,39 +158,87 @@ def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
     )
 
 
+def newest_whole(run: Run) -> Path | None:
+    """Return a run's newest checkpoint that is whole, or None before the first; says which newer ones are damaged.
+
+    Raises:
+        DamagedError: there are checkpoints, and none is whole.
+    """
+    damaged: DamagedError | None = None
+    for checkpoint in reversed(run.checkpoints()):
+        try:
+            description = describe(checkpoint)
+            for file in description["files"]:
+                _read(checkpoint / file, description)
+        except DamagedError as error:
+            click.echo(f"{error.message.partition('; ')[0]}; going on from the checkpoint before it", err=True)
+            damaged = damaged or error
+            continue
+        return checkpoint
+    if damaged is not None:
+        raise DamagedError(f"{run.folder}: no checkpoint is whole; copy one again, or train again with another --out")
+    return None
+
+
 def describe(checkpoint: Path) -> dict[str, Any]:
     """Return a checkpoint's `state.json`.
 
     Raises:
-        UserError: it is missing or damaged, or the folder was renamed.
+        UserError: it is of another format, or the folder was renamed.
+        DamagedError: it is missing or damaged.
     """
-    description = read_json(checkpoint / STATE_FILE, "checkpoint")
-    if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise UserError(f"{checkpoint / STATE_FILE}: expected a checkpoint of format {FORMAT}; train again")
+    path = checkpoint / STATE_FILE
+    try:
+        found = read_json(path, "checkpoint")
+    except MachineError:
+        raise
+    except UserError as error:
+        raise DamagedError(f"{error.message}; {REMEDY}") from None
+    description: dict[str, Any] = found if isinstance(found, dict) else {}
     if description.pop("digest", None) != _digest(description):
-        raise UserError(f"{checkpoint / STATE_FILE}: damaged, its digest does not fit; {REMEDY}")
+        raise DamagedError(f"{path}: damaged, its digest does not fit; {REMEDY}")
+    if description.get("format") != FORMAT:
+        raise UserError(f"{path}: expected a checkpoint of format {FORMAT}; train again")
+    _check_description(path, description)
     if step_of(checkpoint) not in (None, description["step"]):
         raise UserError(f"{checkpoint}: holds step {description['step']}; give the folder its own name again")
     return description
+
+
+def _check_description(path: Path, description: dict[str, Any]) -> None:
+    """Refuse a `state.json` that is whole and was not written by us; a checkpoint names no files but its own."""
+    kinds = {"step": int, "network": dict, "parts": list, "files": dict}
+    if (
+        any(type(description.get(name)) is not kind for name, kind in kinds.items())
+        or not description["parts"]
+        or not all(isinstance(part, str) for part in description["parts"])
+        or not all(_PLAIN_FILE.fullmatch(name) for name in description["files"])
+    ):
+        raise UserError(f"{path}: not the description of a checkpoint; train again")
 
 
 def read_tensors(checkpoint: Path, description: dict[str, Any], name: str) -> dict[str, Tensor]:
     """Return the tensors of one file of a checkpoint after checking its SHA-256.
 
     Raises:
-        UserError: the file is missing or damaged.
+        DamagedError: the file is missing or damaged.
     """
     path = checkpoint / f"{name}.safetensors"
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from None
-    if hashlib.sha256(content).hexdigest() != description["files"].get(path.name):
-        raise UserError(f"{path}: damaged, its SHA-256 is not that of {STATE_FILE}; {REMEDY}")
-    try:
-        return safetensors.torch.load(content)
+        return safetensors.torch.load(_read(path, description))
     except SafetensorError as error:
-        raise UserError(f"{path}: no safetensors file ({error}); {REMEDY}") from None
+        raise DamagedError(f"{path}: no safetensors file ({error}); {REMEDY}") from None
+
+
+def _read(path: Path, description: dict[str, Any]) -> bytes:
+    """Return a file of a checkpoint after checking its SHA-256."""
+    try:
+        content = content_of(path)
+    except OSError as error:
+        raise DamagedError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from None
+    if hashlib.sha256(content).hexdigest() != description["files"].get(path.name):
+        raise DamagedError(f"{path}: damaged, its SHA-256 is not that of {STATE_FILE}; {REMEDY}")
+    return content
 
 
 def _packed(tensors: dict[str, Tensor]) -> bytes:
@@ -203,12 +258,19 @@ def _digest(description: dict[str, Any]) -> str:
 def _fill(path: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
     expected = {name: list(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: list(tensor.shape) for name, tensor in tensors.items()}
+    kinds = {name: tensor.dtype for name, tensor in network.state_dict().items()}
     if found != expected:
         wrong = min(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
         raise UserError(
             f"{path}: of another network: {wrong} should be {expected.get(wrong, 'absent')}, "
             f"is {found.get(wrong, 'absent')}; use a checkpoint of this network"
         )
+    other = next((name for name, tensor in tensors.items() if tensor.dtype != kinds[name]), None)
+    if other is not None:
+        raise UserError(f"{path}: {other} should be {kinds[other]}, is {tensors[other].dtype}; use another checkpoint")
+    broken = next((name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())), None)
+    if broken is not None:
+        raise UserError(f"{path}: {broken} is not finite; use another checkpoint")
     network.load_state_dict(tensors)
 
 

@@ -20,8 +20,10 @@ class Recipe(Settings):
         parse=parse_count,
         none="data",
     )
-    network: str = setting("default", help="Networks: default, paper, or module:network of your own.")
-    batch_size: int = setting(256, help="Transitions of a gradient step.", minimum=2)
+    network: str = setting(
+        "default", help="Networks: default, paper, or module:network of your own, whose code is run."
+    )
+    batch_size: int = setting(256, help="Transitions of a gradient step.", minimum=2, maximum=1_000_000)
     learning_rate: float = setting(2e-3, help="Highest learning rate of AdamW.", minimum=0)
     weight_decay: float = setting(0.02, help="Decoupled weight decay of matrices and filters; 0 is Adam.", minimum=0)
     schedule: Literal["cosine", "constant"] = setting(

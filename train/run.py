@@ -4,25 +4,24 @@ It holds `config.json`, `metrics.jsonl`, `tensorboard/` and `checkpoints/step-NN
 """
 
 import contextlib
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError, naming
-from graspq.common.files import (
-    fsync_folder,
-    locked,
-    read_json,
-    remove_folder,
-    remove_temporaries,
-    writable_folder,
-    write_json,
-    write_text,
+from graspq.common.checksums import (
+    DamagedError,
+    checked_lines,
+    read_checked_json,
+    read_checked_lines,
+    with_checksum,
+    write_checked_json,
 )
+from graspq.common.errors import UserError, naming
+from graspq.common.files import fsync_folder, locked, remove_folder, remove_temporaries, writable_folder, write_text
 
 KEPT_CHECKPOINTS = 3
+REMEDY = "copy the run again, or train again with another --out"
 
 
 def checkpoint_name(step: int) -> str:
@@ -53,10 +52,11 @@ class Run:
 
         Raises:
             UserError: there is none.
+            DamagedError: its `config.json` is not as it was written.
         """
         folder = Path(folder)
-        config = read_json(folder / "config.json", "training run (config.json)")
-        if not isinstance(config, dict) or "settings" not in config:
+        config = read_checked_json(folder / "config.json", "training run (config.json)", REMEDY)
+        if not _is_configuration(config):
             raise UserError(f"{folder / 'config.json'}: not the configuration of a training run; name another folder")
         return cls(folder, config)
 
@@ -73,7 +73,7 @@ class Run:
         if not (folder / "config.json").exists():
             if any(not path.name.startswith(".") for path in folder.iterdir()):
                 raise UserError(f"{folder}: not empty and not a training run; choose another folder with --out")
-            write_json(folder / "config.json", config)
+            write_checked_json(folder / "config.json", config)
             return cls(folder, config)
         run = cls.open(folder)
         run._refuse_other(config, free)
@@ -155,12 +155,17 @@ class Run:
 
         A row of training has `step, loss, samples_per_second, learning_rate` and what the estimator's update measured,
         one of validation `step, validation: {...}`; see `validation.Validation`.
+
+        Raises:
+            DamagedError: a row is not as it was written.
         """
         if not self.metrics_file.exists():
             return []
-        lines = self.metrics_file.read_text().split("\n")
-        # Only a line that ends was written whole.
-        return [json.loads(line) for line in lines[:-1] if line]
+        remedy = "copy the run again, or delete this file: the training goes on without what it says"
+        rows = read_checked_lines(self.metrics_file, "metrics of a training run", remedy, grows=True)
+        if not all(type(row.get("step")) is int and isinstance(row.get("validation", {}), dict) for row in rows):
+            raise DamagedError(f"{self.metrics_file}: not the metrics of a training run; {remedy}")
+        return rows
 
     def summary(self) -> str:
         """Return one line on how the training ended."""
@@ -177,7 +182,7 @@ class Run:
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Add a row to `metrics.jsonl`."""
         with naming(self.metrics_file), self.metrics_file.open("a") as file:
-            file.write(json.dumps(row, allow_nan=False) + "\n")
+            file.write(with_checksum(row))
 
     def sync_metrics(self) -> None:
         """Put the rows so far on the disk: no checkpoint may outlive the rows of the steps before it."""
@@ -189,7 +194,19 @@ class Run:
         """Drop the metrics of later steps, which will be taken again."""
         rows = [row for row in self.metrics() if row["step"] <= step]
         if self.metrics_file.exists():
-            write_text(self.metrics_file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+            write_text(self.metrics_file, checked_lines(rows))
+
+
+def _is_configuration(config: dict[str, Any]) -> bool:
+    """Return whether the parts of a configuration that are there are of their kinds."""
+    settings, dataset = config.get("settings"), config.get("dataset", {})
+    if not isinstance(settings, dict) or not isinstance(dataset, dict):
+        return False
+    parts = [config[name] for name in ("network", "online", "versions") if name in config]
+    parts += [dataset[name] for name in ("task", "object_set") if name in dataset]
+    shards = settings.get("shards", [])
+    listed = isinstance(shards, list) and all(isinstance(shard, str) for shard in shards)
+    return listed and all(isinstance(part, dict) for part in parts)
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from graspq.common.errors import UserError
 from graspq.common.provenance import code_revision, versions
 from graspq.datasets.pool import ShardPool
 from graspq.train.batches import held_back_batches
-from graspq.train.checkpoint import load_checkpoint, save_checkpoint
+from graspq.train.checkpoint import load_checkpoint, newest_whole, save_checkpoint
 from graspq.train.device import chosen_device, chosen_precision, prepare
 from graspq.train.estimator import Estimator
 from graspq.train.networks.network import NetworkSpecification
@@ -117,7 +117,7 @@ def session(
     described: Mapping[str, Any] | None = None,
     ranks: Ranks = ALONE,
 ) -> Iterator[Session]:
-    """Open a run's folder for this process alone: a new one, or the one that is there, at its newest checkpoint.
+    """Open a run's folder for this process alone: a new one, or the one that is there, at its newest whole checkpoint.
 
     Args:
         settings: everything about the run.
@@ -152,7 +152,7 @@ def session(
         def opened() -> tuple[Run, Path | None]:
             run = Run.create_or_resume(settings.run_folder, config, FREE)
             stack.enter_context(run.locked())
-            return run, run.latest_checkpoint()
+            return run, newest_whole(run)
 
         if ranks.first and config["mc_return"].startswith("made"):
             told = f"the data's are of discount {pool.discount:g}"

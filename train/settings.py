@@ -34,7 +34,7 @@ class TrainSettings(Recipe):
     `own` are the options of the estimator, `network_own` those of the networks.
     """
 
-    algo: str = setting(help="Estimator, see below, or module:row of your own.", metavar="NAME")
+    algo: str = setting(help="Estimator, see below, or module:row of your own, whose code is run.", metavar="NAME")
     shards: tuple[str, ...] = setting(help="Dataset folders, shard files or globs; several may follow.")
     out: Path | None = setting(None, help="Run folder; runs/ALGO-DATASET-seedSEED where it is not given.")
     seed: int = setting(0, help="Seed of weights, sample order, augmentation and candidates.", minimum=0)
@@ -47,7 +47,9 @@ class TrainSettings(Recipe):
     )
     device: Device = setting("auto", help="Where to train; auto takes a GPU if there is one.")
     resident: bool = setting(False, help="Keep all images as uint8 on the device, instead of streaming them.")
-    threads: int | None = setting(None, help="CPU threads of torch; its own choice where not given.", minimum=1)
+    threads: int | None = setting(
+        None, help="CPU threads of torch; its own choice where not given.", minimum=1, maximum=1024
+    )
     own: EstimatorSettings
     network_own: NetworkSettings
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,6 +19,7 @@ Trainings = Mapping[Place, Mapping[str, Sequence[tuple[str, float]]]]
 References = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are names, whatever they hold
 def write_figures(study: str, rows: Rows, runs: Trainings, references: References, folder: Path) -> list[Path]:
     """Draw what the scores are enough for; return the files, PNG.
 

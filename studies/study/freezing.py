@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.common.errors import UserError
-from graspq.common.files import read_json, write_json
 from graspq.common.provenance import code_revision
 from graspq.evaluate.records import identity_digest
 from graspq.studies.study.cells import Cell
@@ -47,7 +47,7 @@ def freeze(plan: StudyPlan, cells: Sequence[Cell]) -> Path:
                 f"{path}: holds another recipe, and one is frozen once; delete it only if test was not opened with it"
             )
         return path
-    write_json(path, fresh)
+    write_checked_json(path, fresh)
     return path
 
 
@@ -57,7 +57,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
     Raises:
         UserError: there is none, or its digests are not those of what it says.
     """
-    found: dict[str, Any] = read_json(path, "frozen recipe")
+    found = read_checked_json(path, "frozen recipe", "restore it")
     try:
         rows = {
             name: identity_digest({key: value for key, value in row.items() if key != "digest"})

@@ -1,6 +1,7 @@
 """The plan of a study: a TOML file that says which rows are trained on what, how often, and where they are scored."""
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from graspq.common.errors import UserError
 from graspq.common.files import read_toml
 from graspq.common.options import parse_count
 from graspq.evaluate.jobs import checked_policy
+from graspq.studies.sweep.grid import MOST_TRIALS
 from graspq.studies.sweep.settings import SET_BY_SWEEP
 from graspq.studies.sweep.trial import Options
 from graspq.train.estimators import estimator_named
@@ -118,7 +120,9 @@ def read_plan(path: Path) -> StudyPlan:
         kinds, _, expected = KEYS.get(key, ((), None, ""))
         if not kinds:
             raise UserError(f"{path}: unknown key {key!r}; expected some of {', '.join(KEYS)}")
-        if type(value) not in kinds or (value in ([], 0) and key != "policies"):
+        if type(value) not in kinds or (value == [] and key != "policies") or (type(value) is int and value < 1):
+            raise UserError(f"{path}: {key} = {value!r}; expected {expected}")
+        if key in ("tasks", "policies") and not all(isinstance(one, str) for one in value):
             raise UserError(f"{path}: {key} = {value!r}; expected {expected}")
     values = {key: content.get(key, usual) for key, (_, usual, _) in KEYS.items()}
     for key, allowed in CHOICES.items():
@@ -159,7 +163,11 @@ def _rows(entry: Any, values: Mapping[str, Any]) -> Iterator[Row]:
     taken = sorted({*own, *values["options"]} & SET_BY_SWEEP)
     if taken:
         raise UserError(f"rows: {taken[0]}: the study sets it of each training; use the plan's own keys")
+    if not (name is None or isinstance(name, str)) or not isinstance(preset, str):
+        raise UserError(f"rows: {entry!r}; expected words for name and preset")
     varied = {key: value if isinstance(value, list) else [value] for key, value in own.items()}
+    if math.prod(map(len, varied.values())) > MOST_TRIALS:
+        raise UserError(f"rows: {algo}: its lists make more than {MOST_TRIALS:,} rows; give fewer values")
     points = list(itertools.product(*varied.values()))
     if name is not None and len(points) > 1:
         raise UserError(f"rows: {name!r} would name {len(points)} rows; leave the name out, or the lists")

@@ -3,16 +3,15 @@
 The file is made anew from the evaluations' own files each time, never added to.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from graspq.common.errors import UserError
-from graspq.common.text import write_jsonl
+from graspq.common.text import read_jsonl, write_jsonl
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
-from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
+from graspq.evaluate.records import Evaluation, finished_below
 from graspq.evaluate.results_table import scored
 from graspq.studies.study.cells import Cell
 from graspq.studies.study.freezing import key_of, read_recipe
@@ -152,8 +151,8 @@ def reference(plan: StudyPlan, folder: Path, policy: str, task: str) -> Evaluati
     """Return the score of a policy without a run on the scenes of a task, if it is there."""
     asked = {"label": policy, "task": task, "seed": SCENES_SEED}
     asked |= {"split": plan.split, "episodes": plan.values["episodes"]}
-    for found in find_evaluations(folder / "references"):
-        if all(found.summary.get(name) == value for name, value in asked.items()) and found.has(EPISODES_FILE):
+    for found in finished_below(folder / "references"):
+        if all(found.summary.get(name) == value for name, value in asked.items()):
             return found
     return None
 
@@ -166,12 +165,8 @@ def read_scores(paths: Iterable[Path]) -> list[dict[str, Any]]:
     """
     found: list[dict[str, Any]] = []
     for path in paths:
-        try:
-            lines = [json.loads(line) for line in path.read_text().splitlines()]
-            whole = bool(lines) and all(line["kind"] in KINDS for line in lines)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{path}: not the scores of a study ({error}); run grasp-study run PLAN") from None
-        if not whole:
+        lines = read_jsonl(path, ("kind",), "grasp-study run PLAN", "the scores of a study")
+        if not lines or any(line["kind"] not in KINDS for line in lines):
             raise UserError(f"{path}: not the scores of a study; run grasp-study run PLAN")
         found += lines
     return found

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from graspq.common.files import locked, remove_temporaries, writable_folder, write_json
+from graspq.common.checksums import write_checked_json
+from graspq.common.files import locked, remove_temporaries, writable_folder
 from graspq.common.options import INTERRUPTED, Command, options_from, with_version
 from graspq.engine.plan import PLAN_FILE, Ending, carry_out, older_units
 from graspq.studies.sweep.settings import SweepSettings
@@ -107,7 +108,7 @@ def _run(
         for trial in todo:
             trial.failure_note.unlink(missing_ok=True)
         states = {trial.name: trial.state() for trial in plan}
-        write_json(folder / PLAN_FILE, shared | {"jobs": [trial.to_json() for trial in plan]})
+        write_checked_json(folder / PLAN_FILE, shared | {"jobs": [trial.to_json() for trial in plan]})
         write_tables(folder, list(states.values()))
         finished = len(asked) - len(todo)
         click.echo(f"{folder}: {finished} of {len(asked)} jobs finished before", err=True)

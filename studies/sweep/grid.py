@@ -4,6 +4,7 @@ Source: Quillen et al. 2018, section "Analyzing Stability".
 """
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 
 from graspq.common.errors import UserError
@@ -18,6 +19,7 @@ EXPLORATION_NOTE = (
     "both."
 )
 STEPS_NOTE = "Steps: the paper does not state them; 2000000 are the released code's."
+MOST_TRIALS = 100_000
 # They decide which other options there are.
 DECIDING = ("preset", "network")
 
@@ -26,10 +28,12 @@ def trials_of(settings: SweepSettings) -> list[Trial]:
     """Return the trials of complete settings; one seed's whole grid comes before the next seed's.
 
     Raises:
-        UserError: an estimator is unknown, or an option belongs to none of them.
+        UserError: an estimator is unknown, an option belongs to none of them, or there are too many points.
     """
     own = {name: tuple(f"{value:.12g}" for value in getattr(settings, name)) for name in VARYING}
     grid = [Varied(name, values) for name, values in (own | dict(settings.vary)).items() if values]
+    if math.prod(len(varied.values) for varied in grid) > MOST_TRIALS:
+        raise UserError(f"--vary: more than {MOST_TRIALS:,} points; give fewer values")
     points = {algo: list(_points(algo, settings.on_policy, grid)) for algo in settings.algo or ESTIMATORS}
     used = {name for point in itertools.chain(*points.values()) for name, _ in point}
     unused = {varied.name for varied in settings.vary} - used

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
-from graspq.common.options import flag, parse_count, setting
+from graspq.common.options import MOST, flag, parse_count, setting
 from graspq.engine import EngineSettings
 
 # Source of both grids: Quillen et al. 2018, section "Analyzing Stability".
@@ -79,12 +79,22 @@ class SweepSettings(EngineSettings):
         parse=parse_varied,
         metavar="NAME=V1,V2",
     )
-    seeds: int | None = setting(None, help="Training seeds, from 0 on. Default: 1 (small), 9 (paper).", minimum=1)
+    seeds: int | None = setting(
+        None, help="Training seeds, from 0 on. Default: 1 (small), 9 (paper).", minimum=1, maximum=1000
+    )
     steps: int | None = setting(
-        None, help="Training steps of each run, such as 5k. Default: 5k (small), 2M (paper).", parse=parse_count
+        None,
+        help="Training steps of each run, such as 5k. Default: 5k (small), 2M (paper).",
+        parse=parse_count,
+        minimum=1,
+        maximum=MOST,
     )
     episodes: int | None = setting(
-        None, help="Grasps that each run is scored on. Default: 200 (small), 1000 (paper).", parse=parse_count
+        None,
+        help="Grasps that each run is scored on. Default: 200 (small), 1000 (paper).",
+        parse=parse_count,
+        minimum=1,
+        maximum=MOST,
     )
     device: Literal["auto", "cpu", "cuda"] = setting("auto", help="Where networks run.")
     workers: int | None = setting(
@@ -93,7 +103,9 @@ class SweepSettings(EngineSettings):
         "this process.",
         minimum=0,
     )
-    threads: int | None = setting(None, help="CPU threads of each job. Default: cores / workers, 1 on Ray.", minimum=1)
+    threads: int | None = setting(
+        None, help="CPU threads of each job. Default: cores / workers, 1 on Ray.", minimum=1, maximum=1024
+    )
     out: Path | None = setting(None, help="Folder of the sweep; runs/sweep-PRESET where it is not given.")
     retry_failed: bool = setting(False, help="Run jobs again that failed.")
     dry_run: bool = setting(False, help="Print the plan and stop; nothing is written.")

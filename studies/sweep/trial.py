@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.common.errors import MachineError, UserError
-from graspq.common.files import read_json, write_json
 from graspq.common.options import INTERRUPTED
-from graspq.evaluate.records import EPISODES_FILE, Evaluation, find_evaluations
+from graspq.evaluate.records import Evaluation, finished_below
 from graspq.studies.sweep.commands import PRESET, CommandLine, training_options, training_script, words_for
 from graspq.studies.sweep.settings import GRASPS_PER_ROUND, STEPS_PER_ROUND, SweepSettings
 from graspq.train.run import Run, step_of
@@ -107,12 +107,16 @@ class Trial:
         run = run_in(self.run_folder)
         steps, seconds = trained_steps(run), training_seconds(run) if run is not None else None
         if run is not None and steps >= (self.settings.steps or 0):
-            for found in find_evaluations(run.folder / "evaluations"):
-                if self._is_asked(found.summary) and found.has(EPISODES_FILE):
+            for found in finished_below(run.folder / "evaluations"):
+                if self._is_asked(found.summary):
                     return State(self, steps, seconds, found, None)
         failed = self.failure_note.exists()
-        reason = str(read_json(self.failure_note, "note of a failure")["reason"]) if failed else None
+        reason = self._failure() if failed else None
         return State(self, steps, seconds, None, reason)
+
+    def _failure(self) -> str:
+        note = read_checked_json(self.failure_note, "note of a failure", "delete it, and the trial is done again")
+        return str(note.get("reason"))
 
     def _is_asked(self, summary: dict[str, Any]) -> bool:
         """Return whether an evaluation is of the last step and on the sweep's scenes."""
@@ -199,13 +203,15 @@ class Trial:
     def note_failure(self, command: str, exit_status: int, reason: str) -> None:
         """Note durably that it failed."""
         note = {"id": self.name, "command": command, "exit_status": exit_status, "reason": reason}
-        write_json(self.failure_note, note)
+        write_checked_json(self.failure_note, note)
 
 
 def run_in(folder: Path) -> Run | None:
     """Return the training run in a folder, or None where there is none yet."""
     try:
         return Run.open(folder)
+    except MachineError:
+        raise
     except UserError:
         return None
 

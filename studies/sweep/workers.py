@@ -13,14 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from graspq.common.checksums import write_checked_json
 from graspq.common.errors import MachineError, UserError
-from graspq.common.files import cache_folder, read_json, write_json
+from graspq.common.files import cache_folder
 from graspq.datasets.dataset import open_shards
 from graspq.engine import LostUnitsError, Place, run
 from graspq.engine.shipping import packed, unpack_parts
 from graspq.studies.sweep.checks import objects_beside
 from graspq.studies.sweep.settings import SweepSettings
 from graspq.studies.sweep.trial import Trial, run_in, trained_steps
+from graspq.train.run import Run
 
 T = TypeVar("T", bound=Trial)
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -143,6 +145,6 @@ def _error(trial: Trial) -> str | None:
 def _name_shards(path: Path, shards: Sequence[str]) -> None:
     """Let the configuration of a run name the data as the sweep does, not as the worker's copies."""
     if path.exists():
-        config = read_json(path, "training run")
+        config = Run.open(path.parent).config
         config["settings"]["shards"] = list(shards)
-        write_json(path, config)
+        write_checked_json(path, config)

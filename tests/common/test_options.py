@@ -30,6 +30,25 @@ class Example(Settings):
     mirror: bool = setting(True, help="mirror")
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rate": "0.5"}, "setting rate"),
+        ({"rate": True}, "setting rate"),
+        ({"size": 1.5}, "setting size"),
+        ({"shards": "data"}, "setting shards"),
+        ({"shards": [1]}, "setting shards"),
+        ({"out": 3}, "setting out"),
+        ({"mirror": 1}, "setting mirror"),
+        ({"rate": float("nan")}, "finite"),
+        ([], "expected names and values"),
+    ],
+)
+def test_values_of_a_file_must_be_of_their_types(values, message):
+    with pytest.raises(UserError, match=message):
+        Example.from_json(values)
+
+
 def run(*arguments):
     """Run a command made from `Example`; return (exit status, settings or None)."""
     seen = []

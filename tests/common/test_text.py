@@ -1,12 +1,11 @@
 """Numbers and tables as people read them."""
 
 import csv
-import json
 from pathlib import Path
 
 import pytest
 
-from graspq.common.text import aligned, bytes_text, counted, duration_text, markdown, write_csv, write_jsonl
+from graspq.common.text import aligned, bytes_text, counted, duration_text, markdown, read_jsonl, write_csv, write_jsonl
 
 
 @pytest.mark.parametrize(
@@ -50,7 +49,7 @@ def test_rows_come_back_from_json_lines_and_csv(tmp_path: Path) -> None:
     rows = [{"name": "a, b", "rate": 0.5}, {"name": "c", "rate": None}]
     write_jsonl(tmp_path / "t.jsonl", rows)
     write_csv(tmp_path / "t.csv", ("name", "rate"), rows)
-    assert [json.loads(line) for line in (tmp_path / "t.jsonl").read_text().splitlines()] == rows
+    assert read_jsonl(tmp_path / "t.jsonl", ("name",), "a command", "a table") == rows
     with (tmp_path / "t.csv").open(newline="") as file:
         assert list(csv.DictReader(file)) == [{"name": "a, b", "rate": "0.5"}, {"name": "c", "rate": ""}]
     with pytest.raises(ValueError, match="not in fieldnames"):

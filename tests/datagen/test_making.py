@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -94,6 +95,21 @@ def test_a_smaller_dataset_is_extended_to_the_same_bytes(finished, tmp_path, obj
     assert Manifest.load(folder).episodes == 50
     run(*SMALL, "--out", folder, "--objects", objects)
     assert digests(folder) == digests(finished)
+
+
+def test_damaged_and_missing_shards_are_made_again(finished, tmp_path, objects):
+    folder = tmp_path / "damaged"
+    shutil.copytree(finished, folder)
+    steps, episodes = ((folder / part).glob("*.parquet") for part in ("shards", "episodes"))
+    content = bytearray((path := next(steps)).read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    done = run(*SMALL, "--out", folder, "--objects", objects, "--workers", 1)
+    assert f"{path}: damaged, its SHA-256 is not that of the manifest; it is made again" in done.stderr
+    assert digests(folder) == digests(finished)
+    next(episodes).unlink()
+    refused = run("--size", "20", "--seed", "3", "--out", folder, "--objects", objects, expect=2)
+    assert "ask for 130 grasps or more to make it again" in refused.stderr
 
 
 def test_a_finished_dataset_is_left_alone(finished, objects):

@@ -4,7 +4,7 @@ import json
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.datasets.manifest import Manifest, shard_name
+from graspq.datasets.manifest import Manifest, _digest_of, shard_name
 
 
 def test_a_manifest_survives_saving_and_loading(dataset):
@@ -66,7 +66,7 @@ def test_a_shard_that_starts_at_the_same_block_is_replaced(dataset):
         name=name,
         blocks=3,
         files={f"{part}/{name}.parquet": "0" * 64 for part in ("shards", "episodes")},
-        sizes={f"{part}/{name}.parquet": 1 for part in ("shards", "episodes")},
+        sizes={f"{part}/{name}.parquet": 1000 for part in ("shards", "episodes")},
     )
     assert [entry.name for entry in manifest.with_shard(longer).shards] == [
         "blocks-000000-000004",
@@ -90,6 +90,47 @@ def test_a_shard_cannot_name_files_elsewhere(dataset):
     entry = Manifest.load(dataset).shards[0]
     with pytest.raises(ValueError, match="expected the files"):
         dataclasses.replace(entry, files={"../../elsewhere": "0"})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"blocks": 10**18}, "expected whole numbers"),
+        ({"rows": True}, "expected whole numbers"),
+        ({"blocks": 10**9, "episodes": 10**9, "rows": 10**9}, "1000000000 blocks"),
+        ({"rows": 1}, "1 rows"),
+    ],
+)
+def test_counts_that_cannot_be_are_not_believed(dataset, change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(Manifest.load(dataset).shards[0], **change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"task": {"name": "regular"}},
+        {"settings": {"block_size": 0}},
+        {"image_shape": (10**9, 64, 3)},
+        {"discount": float("nan")},
+        {"files": {"../secret": "0"}},
+        {"files": {"/etc/passwd": "0"}},
+        {"phi_range": (1.0,)},
+    ],
+)
+def test_what_no_command_writes_is_refused_before_anything_is_allocated(dataset, change):
+    with pytest.raises(ValueError, match="expected"):
+        dataclasses.replace(Manifest.load(dataset), **change)
+
+
+def test_a_signed_manifest_of_anything_gives_one_line(dataset, tmp_path):
+    values = json.loads((dataset / "manifest.json").read_text())
+    for change in ({"shards": 5}, {"action": [1]}, {"more": 1}, {"shards": [5]}, {"action": {"limits": [10**400] * 4}}):
+        changed = {name: value for name, value in {**values, **change}.items() if name != "digest"}
+        changed["digest"] = _digest_of(changed)
+        (tmp_path / "manifest.json").write_text(json.dumps(changed, indent=2, ensure_ascii=False) + "\n")
+        with pytest.raises(UserError, match=r"not a dataset manifest of this version|action space"):
+            Manifest.load(tmp_path)
 
 
 def test_a_manifest_of_before_keeps_its_digest_and_means_grasping_actions(dataset, tmp_path):

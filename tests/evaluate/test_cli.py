@@ -14,6 +14,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.common.files import sha256_of
 from graspq.evaluate.films import read_films
 from graspq.evaluate.recipe_digest import recipe_digest
@@ -83,7 +84,7 @@ def test_several_jobs_give_one_table_in_two_formats(workplace: SimpleNamespace) 
 
 def test_a_row_names_data_recipe_and_code_and_holds_every_outcome(workplace: SimpleNamespace, run_folder: Path) -> None:
     run, random = read_results(workplace.out / "results.jsonl")
-    config = json.loads((run_folder / "config.json").read_text())
+    config = read_checked_json(run_folder / "config.json", "run", "")
     assert run["data_sha256"] == config["dataset"]["manifest_sha256"]
     assert (run["trained_by"], run["training_seed"]) == (config["code_revision"], 0)
     assert run["recipe_sha256"] == recipe_digest(config, CemSettings())
@@ -96,7 +97,7 @@ def test_a_row_names_data_recipe_and_code_and_holds_every_outcome(workplace: Sim
 
 
 def test_the_digest_of_a_recipe_follows_what_decides_what_is_learned_and_nothing_else(run_folder: Path) -> None:
-    config = json.loads((run_folder / "config.json").read_text())
+    config = read_checked_json(run_folder / "config.json", "run", "")
     digest = recipe_digest(config, CemSettings())
 
     def changed(**settings: object) -> str:
@@ -118,9 +119,9 @@ def test_runs_of_several_training_seeds_are_summed_up_in_one_line(
 ) -> None:
     for seed in (0, 1):
         shutil.copytree(run_folder, tmp_path / f"mc-seed{seed}")
-        config = json.loads((run_folder / "config.json").read_text())
+        config = read_checked_json(run_folder / "config.json", "run", "")
         config["settings"]["seed"] = seed
-        (tmp_path / f"mc-seed{seed}" / "config.json").write_text(json.dumps(config))
+        write_checked_json(tmp_path / f"mc-seed{seed}" / "config.json", config)
     done = command("grasp-eval", f"{tmp_path}/mc-seed*", *SMALL, "--films", "0", "--out", tmp_path / "scores")
     assert done.code == 0, done.err
     summed_up = r"^mc  regular validation  2 training seeds  [\d.]+ %  95 %: [\d.]+ to [\d.]+$"
@@ -142,9 +143,9 @@ def test_policies_without_a_run_meet_the_scenes_of_the_run_beside_them(
 
     other = tmp_path / "run"
     shutil.copytree(run_folder, other)
-    config = json.loads((other / "config.json").read_text())
+    config = read_checked_json(other / "config.json", "run", "")
     config["dataset"]["task"]["finger_force"] = 17.0
-    (other / "config.json").write_text(json.dumps(config))
+    write_checked_json(other / "config.json", config)
     run, random, oracle = make_plan(
         jobs_from_settings(replace(workplace.settings, runs=(str(other),), policy=("random", "oracle"))),
         workplace.settings,
@@ -163,9 +164,9 @@ def test_policies_without_a_run_are_given_the_task_that_the_runs_beside_them_hav
 
     targeted = tmp_path / "targeted"
     shutil.copytree(run_folder, targeted)
-    config = json.loads((targeted / "config.json").read_text())
+    config = read_checked_json(targeted / "config.json", "run", "")
     config["dataset"]["task"] = TASKS["targeted"].settings.to_json()
-    (targeted / "config.json").write_text(json.dumps(config))
+    write_checked_json(targeted / "config.json", config)
 
     def tasks(*runs: Path, objects: Path | None = None) -> list[str]:
         settings = replace(workplace.settings, runs=tuple(map(str, runs)), policy=("oracle",), objects=objects)
@@ -322,9 +323,9 @@ def test_another_object_set_than_the_runs_must_be_asked_for(
     monkeypatch.chdir(tmp_path)
     moved = tmp_path / "run"
     shutil.copytree(run_folder, moved)
-    config = json.loads((moved / "config.json").read_text())
+    config = read_checked_json(moved / "config.json", "run", "")
     config["dataset"]["object_set"] = {"name": "procedural", "sha256": "0" * 64}
-    (moved / "config.json").write_text(json.dumps(config))
+    write_checked_json(moved / "config.json", config)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     own = make_procedural(
         tmp_path / f"graspq/objects/regular-{GENERATOR_VERSION}", seed=SEED, train=5, test=5, validation=5
@@ -345,6 +346,7 @@ def test_objects_that_a_run_was_trained_on_are_not_tested_under_another_name(
     for one in values["objects"]:
         one["split"] = swap.get(one["split"], one["split"])
     (renamed / "object_set.json").write_text(json.dumps(values))
+    (renamed / "object_set.json.sha256").unlink()
     words = (run_folder, *SMALL, "--plan", "--objects", renamed)
     refused = command("grasp-eval", *words)
     assert refused.code == 2 and len(refused.lines) == 1

@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -134,6 +135,25 @@ def test_a_missing_or_corrupted_manifest_is_a_user_error(tmp_path: Path) -> None
         (tmp_path / "object_set.json").write_bytes(content)
         with pytest.raises(UserError, match="not a readable object set"):
             ObjectSet.load(tmp_path)
+
+
+def test_a_manifest_is_compared_with_the_digest_beside_it(copied: ObjectSet) -> None:
+    path, beside = copied.folder / "object_set.json", copied.folder / "object_set.json.sha256"
+    assert beside.read_text() == f"{copied.digest()}  object_set.json\n"
+    edited = path.read_bytes().replace(b'"mass": 0.', b'"mass": 1.', 1)
+    path.write_bytes(edited)
+    with pytest.raises(UserError, match=r"object_set\.json: damaged or edited"):
+        ObjectSet.load(copied.folder)
+    beside.unlink()  # a set that an older version made
+    assert ObjectSet.load(copied.folder).digest() != copied.digest()
+
+
+@pytest.mark.parametrize("name", ["object_set.json", "meshes/train_000.obj"])
+def test_a_pipe_is_not_waited_for(copied: ObjectSet, name: str) -> None:
+    (copied.folder / name).unlink()
+    os.mkfifo(copied.folder / name)
+    with pytest.raises(UserError, match=r"not a regular file|or a pipe"):
+        ObjectSet.load(copied.folder)
 
 
 @pytest.mark.parametrize("name", ["meshes", "meshes/train_000.obj"])

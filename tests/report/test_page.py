@@ -1,6 +1,5 @@
 """The report: one self-contained page from real runs and evaluations, also before anything is evaluated."""
 
-import json
 import re
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.evaluate.films import Film, write_films
 from graspq.evaluate.records import FORMAT_VERSION, EpisodeRow, Evaluation, write_rows, write_summary
 from graspq.evaluate.statistics import (
@@ -108,9 +108,9 @@ def scored(tmp_path: Path, run_folder: Path) -> Path:
     hard = rng.random(200)
     for name, rate in (("mc", 0.6), ("dql", 0.5)):
         shutil.copytree(run_folder, tmp_path / "runs" / name)
-        config = json.loads((tmp_path / "runs" / name / "config.json").read_text())
+        config = read_checked_json(tmp_path / "runs" / name / "config.json", "run", "")
         config["settings"] |= {"algo": name, "out": name}
-        (tmp_path / "runs" / name / "config.json").write_text(json.dumps(config))
+        write_checked_json(tmp_path / "runs" / name / "config.json", config)
         make_evaluation(tmp_path / f"runs/{name}/evaluations/regular-test-seed0-200", name, hard < rate, films=2)
     for name, rate in (("random", 0.2), ("oracle", 0.95)):
         make_evaluation(tmp_path / f"baselines/{name}", name, hard < rate, policy=name)

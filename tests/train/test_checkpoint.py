@@ -1,6 +1,7 @@
 """Checkpoints: what is saved comes back, and what is damaged or foreign is refused in one line."""
 
 import dataclasses
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import torch
 from plain import FLOAT32
 
 from graspq.common.errors import UserError
-from graspq.train.checkpoint import load_acting, load_checkpoint, save_checkpoint
+from graspq.train.checkpoint import describe, load_acting, load_checkpoint, save_checkpoint
 from graspq.train.loop import train
 from graspq.train.networks.network import NetworkSpecification
 from graspq.train.run import Run
@@ -94,11 +95,42 @@ def test_a_single_flipped_bit_anywhere_is_noticed(run: Run, name: str) -> None:
     load_acting(run.folder)
 
 
-@pytest.mark.parametrize("name", ["q.safetensors", "lagged-q.safetensors", "optimizer-q.safetensors"])
-def test_training_does_not_go_on_from_a_damaged_checkpoint(settings: Make, run: Run, name: str) -> None:
-    flip(run.checkpoint() / name, -1)
-    with pytest.raises(UserError, match=rf"{name}: damaged, .* delete this checkpoint's folder"):
-        train(settings("dql", steps=2))
+def test_training_goes_on_from_the_newest_whole_checkpoint_and_says_so(
+    settings: Make, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = train(settings("dql", steps=6, save_every=2))
+    whole, metrics = load_acting(run.folder).sha256, [row for row in run.metrics() if "validation" in row]
+    newest, before, first = reversed(run.checkpoints())
+    flip(newest / "lagged-q.safetensors", -1)
+    (before / "optimizer-q.safetensors").unlink()
+    with pytest.raises(UserError, match="delete this checkpoint's folder to go on from the one before it"):
+        load_checkpoint(newest, fresh_state(NetworkSpecification.from_json(run.config["network"]), settings("dql")))
+    capsys.readouterr()
+    train(settings("dql", steps=6, save_every=2))
+    said = [line for line in capsys.readouterr().err.splitlines() if "checkpoint before it" in line]
+    assert [str(newest) in said[0], str(before) in said[1], len(said)] == [True, True, 2]
+    assert load_acting(run.folder).sha256 == whole
+    assert [row for row in run.metrics() if "validation" in row] == metrics
+    for checkpoint in (newest, before, first):
+        flip(checkpoint / "state.json", 40)
+    with pytest.raises(UserError, match="no checkpoint is whole"):
+        train(settings("dql", steps=6, save_every=2))
+
+
+def test_a_checkpoint_names_no_files_but_its_own_and_its_weights_are_finite(run: Run, settings: Make) -> None:
+    state = fresh_state(NetworkSpecification.from_json(run.config["network"]), settings("dql"))
+    parameter = next(state.networks.online["q"].parameters())
+    parameter.data.fill_(torch.nan)
+    broken = save_checkpoint(run.folder / "again", state)
+    with pytest.raises(UserError, match=r"q\.safetensors: .* is not finite"):
+        load_checkpoint(broken, state)
+    description = describe(run.checkpoint())
+    for change in ({"files": {"../../config.json": "0" * 64}}, {"files": []}, {"step": "2"}, {"parts": [1]}):
+        changed = description | change
+        digest = hashlib.sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()
+        (run.checkpoint() / "state.json").write_text(json.dumps(changed | {"digest": digest}))
+        with pytest.raises(UserError, match="not the description of a checkpoint"):
+            load_acting(run.folder)
 
 
 def test_a_truncated_or_missing_file_is_refused(run: Run) -> None:

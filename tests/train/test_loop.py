@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from graspq.common.action_space import ActionSpace
+from graspq.common.checksums import with_checksum
 from graspq.common.errors import UserError
 from graspq.train import loop
 from graspq.train.acting import Acting, ObservedState
@@ -79,7 +80,7 @@ def test_what_was_killed_is_taken_up_from_the_last_checkpoint_without_double_met
     run = train(settings(out=tmp_path / "broken"), stop_at=10)
     # What a kill leaves: metrics beyond the checkpoint, a row cut short, and a half-written checkpoint.
     with run.metrics_file.open("a") as file:
-        file.write('{"step": 15, "loss": 123.0}\n{"step": 20, "lo')
+        file.write(with_checksum({"step": 15, "loss": 123.0}) + '{"step": 20, "lo')
     (run.checkpoints_folder / ".tmp-1-step-00000020").mkdir()
     resumed = train(settings(out=tmp_path / "broken"))
     assert [row.get("loss") for row in resumed.metrics()] == [row.get("loss") for row in unbroken.metrics()]

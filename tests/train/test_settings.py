@@ -122,7 +122,7 @@ def test_settings_survive_json() -> None:
     ("wrong", "message"),
     [
         ({"algo": "sarsa"}, "'sarsa' is unknown; choose from supervised, dql, mc"),
-        ({"batch_size": 1}, "--batch-size: expected a number of at least 2, got 1"),
+        ({"batch_size": 1}, "--batch-size: expected a number of at least 2 and at most 1e.06, got 1"),
         ({"network": "resnet"}, "'resnet' is unknown"),
         ({"loss": "hinge"}, "'hinge' is unknown"),
         ({"discount": 1.5}, "--discount"),

@@ -16,6 +16,7 @@ from graspq.common.options import Settings
 
 Features = tuple[Tensor, ...]
 Link = Literal["logistic", "identity"]
+LARGEST = 10_000  # of what a file may say of images and steps, before anything is allocated by it
 
 
 class QNetwork(nn.Module):
@@ -116,14 +117,16 @@ class NetworkSpecification:
         """Return the specification that `to_json` wrote.
 
         Raises:
-            UserError: a name is missing or unknown, or the link is.
+            UserError: a name is missing or unknown, or a value is none that we write.
         """
         names = {field.name for field in dataclasses.fields(cls)}
-        if set(values) != names or values["link"] not in get_args(Link) or len(values["image_shape"]) != 3:
+        if set(values) != names or values["link"] not in get_args(Link):
             raise UserError(f"network specification {values!r}: expected {', '.join(sorted(names))}; train again")
-        height, width, channels = values["image_shape"]
-        shape = (int(height), int(width), int(channels))
-        return cls(**values | {"image_shape": shape, "action": ActionSpace.from_json(values["action"])})
+        shape, steps = values["image_shape"], values["steps"]
+        right = isinstance(shape, list) and len(shape) == 3 and isinstance(values["settings"], dict)
+        if not right or not all(type(size) is int and 1 <= size <= LARGEST for size in (*shape, steps)):
+            raise UserError(f"network specification: images of {shape} and {steps} steps; train again")
+        return cls(**values | {"image_shape": tuple(shape), "action": ActionSpace.from_json(values["action"])})
 
 
 class NetworkFamily(NamedTuple):

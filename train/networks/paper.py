@@ -28,7 +28,7 @@ EPSILON = 1e-12
 class PaperNetworkSettings(NetworkSettings):
     """Options of the paper's network."""
 
-    width: int = setting(32, help="Channels and units.", minimum=1)
+    width: int = setting(32, help="Channels and units.", minimum=1, maximum=10_000)
 
 
 def _units(specification: NetworkSpecification) -> int:

@@ -1,9 +1,9 @@
-import json
 import shutil
 from pathlib import Path
 
 import pytest
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.studies.online.cli import main
 
 
@@ -57,8 +57,8 @@ def test_the_help_shows_the_rounds_and_the_options_of_the_start_runs_estimator(
 
 def test_data_of_another_task_are_refused(capsys: pytest.CaptureFixture[str], start: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(start, tmp_path / "other")
-    config = json.loads((copy / "config.json").read_text())
+    config = read_checked_json(copy / "config.json", "run", "")
     config["dataset"]["task"]["trigger_height"] = 0.5
-    (copy / "config.json").write_text(json.dumps(config))
+    write_checked_json(copy / "config.json", config)
     code, _, err = called(capsys, "--start", copy, "--out", tmp_path / "never")
     assert code == 2 and "of another task than that of" in err and not (tmp_path / "never").exists()

@@ -1,10 +1,10 @@
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.common.errors import UserError
 from graspq.studies.online.resolve import Plan, resolve
 from graspq.train.settings import complete
@@ -40,17 +40,17 @@ def test_training_goes_on_at_the_constant_rate_of_its_run(make_plan: Make, tmp_p
 def test_the_correction_of_corr_mc_stays_risen(make_plan: Make, start: Path, tmp_path: Path, base: Path) -> None:
     settings = complete({"algo": "corr-mc", "shards": (str(base),)}, "paper")
     copy = shutil.copytree(start, tmp_path / "corr-mc")
-    config = json.loads((copy / "config.json").read_text()) | {"settings": settings.to_json()}
-    (copy / "config.json").write_text(json.dumps(config))
+    config = read_checked_json(copy / "config.json", "run", "") | {"settings": settings.to_json()}
+    write_checked_json(copy / "config.json", config)
     assert settings.own.anneal == 0.05
     assert make_plan(tmp_path / "out", start=copy).train.own.anneal == 0.0
 
 
 def test_after_a_rate_that_fell_to_zero_it_goes_on_at_a_tenth(make_plan: Make, start: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(start, tmp_path / "cosine")
-    config = json.loads((copy / "config.json").read_text())
+    config = read_checked_json(copy / "config.json", "run", "")
     config["settings"] |= {"schedule": "cosine", "learning_rate": 0.02}
-    (copy / "config.json").write_text(json.dumps(config))
+    write_checked_json(copy / "config.json", config)
     train = make_plan(tmp_path / "out", start=copy).train
     assert (train.schedule, train.learning_rate) == ("constant", 0.002)
 

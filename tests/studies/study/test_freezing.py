@@ -1,12 +1,12 @@
 """The frozen recipe: `test` opens with it alone, and nothing in it can change unseen."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from graspq.common.checksums import read_checked_json, write_checked_json
 from graspq.common.errors import UserError
 from graspq.studies.study.freezing import freeze, read_recipe, require_frozen
 
@@ -33,9 +33,12 @@ def test_a_recipe_is_frozen_once(plan: Callable[..., Any]) -> None:
 
 def test_a_recipe_that_was_edited_is_refused(plan: Callable[..., Any]) -> None:
     freeze(*plan())
-    recipe = json.loads(Path("recipe.json").read_text())
+    recipe = read_checked_json(Path("recipe.json"), "recipe", "")
     recipe["rows"]["mc-12"]["training"]["learning_rate"] = 1.0
-    Path("recipe.json").write_text(json.dumps(recipe))
+    Path("recipe.json").write_text(Path("recipe.json").read_text().replace("code_revision", "core_revision"))
+    with pytest.raises(UserError, match=r"checksum is not that of its content\); restore it"):
+        read_recipe(Path("recipe.json"))
+    write_checked_json(Path("recipe.json"), recipe)
     with pytest.raises(UserError, match="edited by hand"):
         read_recipe(Path("recipe.json"))
     Path("recipe.json").write_text("{}")

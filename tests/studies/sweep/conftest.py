@@ -36,7 +36,7 @@ def trials(settings: SweepSettings) -> list[Trial]:
 
 def trained(trial: Trial, step: int, rows: tuple[dict[str, Any], ...] = ()) -> Run:
     """A run folder with its configuration, metrics and the newest checkpoint's folder."""
-    config = {"settings": {"batch_size": 32}, "network": 0, "dataset": {}}
+    config = {"settings": {"batch_size": 32}, "network": {}, "dataset": {}}
     run = Run.create_or_resume(trial.run_folder, config, frozenset())
     for row in rows:
         run.append_metrics(row)

@@ -1,13 +1,13 @@
 """The table: the same rows in every format."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from graspq.evaluate.statistics import wilson_interval
+from graspq.evaluate.sweep_table import read_sweep_table
 from graspq.studies.sweep.table import OUTCOME, as_markdown, line_of, write_tables
 from graspq.studies.sweep.trial import State, Trial
 
@@ -24,7 +24,7 @@ def states(trials: list[Trial], write: Any) -> list[State]:
 
 def test_json_lines_and_csv_hold_the_same_rows(states: list[State], tmp_path: Path) -> None:
     write_tables(tmp_path, states)
-    failed, done, todo = (json.loads(line) for line in (tmp_path / "sweep.jsonl").read_text().splitlines())
+    failed, done, todo = read_sweep_table(tmp_path / "sweep.jsonl")
     assert tuple(done) == ("id", "algo", "learning_rate", "width", "discount", "seed", *OUTCOME)
     assert (done["status"], done["steps"], done["success_rate"], done["training_seconds"]) == ("done", 100, 0.3, 1.0)
     assert (done["ci95_low"], done["ci95_high"]) == wilson_interval(3, 10)
