@@ -148,10 +148,11 @@ def _model(source: Path, object_id: str, path: Path, split: str, scale: float, d
 def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
     """Return the meshes of a file: the groups of an OBJ one by one, since convex ones may share corners."""
     try:
-        scene = trimesh.load_scene(
-            path, split_objects=True, split_groups=True, group_material=False, skip_materials=True
-        )
+        options = {"split_objects": True, "split_groups": True, "group_material": False, "skip_materials": True}
+        scene = trimesh.load_scene(path, **options)
         meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0]
+        # As the file has them: the other way leaves out corners that are not finite, which makes it another shape.
+        corners = [mesh.vertices for mesh in trimesh.load_scene(path, process=False, **options).geometry.values()]
     except FileNotFoundError:
         raise UserError(f"{path}: no such mesh file") from None
     # The readers of mesh formats raise whatever a damaged file leads them to.
@@ -161,7 +162,7 @@ def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
         raise UserError(
             f"{path}: an empty mesh or a damaged file, no triangle with finite corners; repair or remove it"
         )
-    if not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
+    if not all(np.isfinite(some).all() for some in corners):
         raise UserError(f"{path}: has corners that are not finite numbers; repair or remove it")
     return meshes
 

@@ -45,10 +45,11 @@ class Fault:
 
 @dataclass(frozen=True)
 class Tried:
-    """What became of a fault, and the line that the command said or what was found."""
+    """What became of a fault, the line that the command said or what was found, and how many cases it was of."""
 
     outcome: Outcome
     said: str = ""
+    cases: int = 1
 
 
 @dataclass(frozen=True)
@@ -384,7 +385,7 @@ class Log:
         for line in lines:
             values = json.loads(line)
             fault = Fault(values["kind"], values["command"], values["name"])
-            self.tried[fault] = values["code"], Tried(values["outcome"], values["said"])
+            self.tried[fault] = values["code"], Tried(values["outcome"], values["said"], values.get("cases", 1))
         if self.path.exists():
             self.path.write_text("".join(f"{line}\n" for line in lines))
 
@@ -396,7 +397,7 @@ class Log:
         """Append one."""
         self.tried[fault] = code, tried
         values = {"kind": fault.kind, "command": fault.command, "name": fault.name, "code": code}
-        values |= {"outcome": tried.outcome, "said": tried.said, "seconds": round(seconds, 2)}
+        values |= {"outcome": tried.outcome, "said": tried.said, "seconds": round(seconds, 2), "cases": tried.cases}
         with self.path.open("a") as file:
             file.write(json.dumps(values) + "\n")
 
@@ -423,8 +424,8 @@ def rows_of(tried: Iterable[tuple[Fault, Tried]]) -> list[dict[str, Any]]:
     for fault, one in tried:
         empty = {"fault": fault.kind, "command": fault.command, "tried": 0} | dict.fromkeys(OUTCOMES, 0)
         row = rows.setdefault((fault.kind, fault.command), empty)
-        row["tried"] += 1
-        row[one.outcome] += 1
+        row["tried"] += one.cases
+        row[one.outcome] += one.cases
     return list(rows.values())
 
 

@@ -1,9 +1,13 @@
 """All kinds of faults, in the order of the table."""
 
+from tests.faults.bits import Bits
 from tests.faults.crash_points import CrashPoints, KilledByStrace
 from tests.faults.failing_calls import FullDisk, Limits, ReadOnly, failing_calls
+from tests.faults.fuzz import Fuzz
 from tests.faults.harness import Kind
+from tests.faults.hostile import Hostile
 from tests.faults.power_loss import PowerLoss
+from tests.faults.shards import Shards
 
 KINDS: list[Kind] = [
     CrashPoints(),
@@ -15,4 +19,8 @@ KINDS: list[Kind] = [
     ReadOnly(),
     Limits("few open files (ulimit -n)", "RLIMIT_NOFILE", (64, 32, 24, 16)),
     Limits("little memory (ulimit -v), MiB above the start", "RLIMIT_AS", (64, 16, 256)),
+    Bits(),
+    Shards(),
+    Hostile(),
+    Fuzz(),
 ]

@@ -23,6 +23,7 @@ class Planted:
         kind: name of the kind of fault that must find it.
         commands: whose faults are tried, in this order, until one finds it.
         most: at most so many faults are tried of each command, evenly spread; all where it is 0.
+        names: only faults whose name holds one of these; all where there are none.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Planted:
     kind: str
     commands: tuple[str, ...]
     most: int = 0
+    names: tuple[str, ...] = ()
 
 
 FILES = "common/files.py"
@@ -111,6 +113,86 @@ PLANTED = [
         "EIO in fsync",
         ("grasp-eval", "grasp-train"),
     ),
+    Planted(
+        "checksums are not compared",
+        "common/checksums.py",
+        "if found is None or found[1].decode() != _checksum(blank):",
+        "if found is None:",
+        "bit",
+        ("grasp-report",),
+        30,
+        ("config.json ", "eval.json ", "sweep.jsonl "),
+    ),
+    Planted(
+        "films are not compared with eval.json",
+        "evaluate/films.py",
+        "if not evaluation.has(FILMS_FILE):",
+        "if False:",
+        "bit",
+        ("grasp-report",),
+        12,
+        ("films.npz ",),
+    ),
+    Planted(
+        "object_set.json is not compared with its digest",
+        "objects/object_set.py",
+        "        _check_own(path)\n",
+        "",
+        "bit",
+        ("grasp-eval",),
+        30,
+        ("object set ",),
+    ),
+    Planted(
+        "shards are not compared with the manifest",
+        "datasets/dataset.py",
+        "if verify and sha256_of(path) != self.entry.files[name]:",
+        "if False:",
+        "bit",
+        ("grasp-data verify",),
+        20,
+        ("card ", "episodes table ", "steps table "),
+    ),
+    Planted(
+        "grasp-datagen believes that listed shards are whole",
+        "datagen/making.py",
+        "            found[entry.first_block] = reason\n",
+        "            pass\n",
+        "shard",
+        ("grasp-datagen",),
+        4,
+        ("missing, shards", "cut in half, shards"),
+    ),
+    Planted(
+        "the kinds of a manifest are not checked",
+        "datasets/manifest.py",
+        "        _check_kinds(self)\n",
+        "",
+        "hostile file",
+        ("grasp-data",),
+        30,
+        ("manifest: ",),
+    ),
+    Planted(
+        "a pipe is waited for",
+        "common/files.py",
+        "            if not stat.S_ISREG(path.stat().st_mode):\n",
+        "            if False:\n",
+        "hostile file",
+        ("grasp-eval",),
+        1,
+        ("run: a pipe",),
+    ),
+    Planted(
+        "weights need not be finite",
+        "train/checkpoint.py",
+        "    if broken is not None:\n",
+        "    if False:\n",
+        "hostile file",
+        ("grasp-eval",),
+        1,
+        ("weights: not finite",),
+    ),
 ]
 
 
@@ -155,6 +237,7 @@ def found_by(planted: Planted, kind: Kind, work: Work) -> tuple[Fault, Tried] | 
 def _asked(planted: Planted, faults: Sequence[Fault]) -> Iterator[Fault]:
     for command in planted.commands:
         here = [fault for fault in faults if fault.command == command]
+        here = [fault for fault in here if not planted.names or any(name in fault.name for name in planted.names)]
         count = min(planted.most or len(here), len(here))
         yield from (here[(2 * one + 1) * len(here) // (2 * count)] for one in range(count))
         yield from here[-1:]
