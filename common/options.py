@@ -299,13 +299,11 @@ def _click_type(hint: Any) -> Any:
     )
 
 
-def _spread_repeated(command: click.Command, args: list[str]) -> list[str]:
+def _spread_repeated(parameters: Sequence[click.Parameter], args: list[str]) -> list[str]:
     """Let an option that may be repeated take several words, as a shell's glob gives: `--shards a b c`."""
-    if any(isinstance(parameter, click.Argument) for parameter in command.params):
+    if any(isinstance(parameter, click.Argument) for parameter in parameters):
         return args
-    repeated = {
-        name for parameter in command.params if getattr(parameter, "multiple", False) for name in parameter.opts
-    }
+    repeated = {name for parameter in parameters if getattr(parameter, "multiple", False) for name in parameter.opts}
     spread: list[str] = []
     current: str | None = None
     for word in args:
@@ -359,7 +357,7 @@ class Command(_OneLineErrors, click.Command):  # type: ignore[misc]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse after spreading repeated options; see `_spread_repeated`."""
-        return super().parse_args(ctx, _spread_repeated(self, args))
+        return super().parse_args(ctx, _spread_repeated(self.get_params(ctx), args))
 
 
 class Group(_OneLineErrors, click.Group):  # type: ignore[misc]

@@ -73,7 +73,7 @@ class TrainingCommand(Command):
 def value_of(option: str, words: Sequence[str]) -> str | None:
     """Return the value that a command line's words give to an option, the last where it stands twice."""
     found = None
-    for word, following in zip(words, [*words[1:], None], strict=True):
+    for word, following in zip(words, [*words, None][1:], strict=True):
         name, equals, value = word.partition("=")
         if name == option:
             found = value if equals else following

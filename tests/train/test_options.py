@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import pytest
 
 from graspq.common.errors import UserError
@@ -13,6 +14,7 @@ from graspq.common.options import setting
 from graspq.train.cli import main
 from graspq.train.estimator import RegressionSettings
 from graspq.train.estimators import ESTIMATORS, estimator_named
+from graspq.train.options import value_of
 from graspq.train.run import Run
 from graspq.train.settings import complete
 
@@ -192,3 +194,15 @@ def test_an_option_of_an_estimator_may_not_take_the_name_of_one_of_its_networks(
     assert complete({"algo": "mine", "shards": ("data",), "width": 3}).own.to_json()["width"] == 3
     with pytest.raises(UserError, match=r"Settings\.width is the name of an option of --network paper"):
         complete({"algo": "mine", "shards": ("data",), "network": "paper"})
+
+
+def test_several_shards_may_follow_their_option_and_no_words_name_no_estimator() -> None:
+    for words in (
+        ["--algo", "mc", "--shards", "a", "b", "--seed", "1"],
+        ["--algo", "mc", "--shards", "a", "--shards", "b"],
+    ):
+        context = main.make_context("grasp-train", words)
+        assert context.params["shards"] == ("a", "b")
+    assert value_of("--algo", []) is None
+    with pytest.raises(click.UsageError):
+        main.make_context("grasp-train", ["a"])
