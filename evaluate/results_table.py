@@ -16,6 +16,7 @@ from graspq.common.text import read_jsonl, write_csv, write_jsonl
 from graspq.evaluate.records import Evaluation
 
 RESULTS_FILE = "results.jsonl"
+TABLE_FILE = "results.csv"  # the same for spreadsheets; written last
 COLUMNS = (
     "label", "policy", "run", "algo", "training_seed", "checkpoint_step", "task", "split", "seed", "episodes", "status",
     "successes", "success_rate", "ci95_low", "ci95_high", "mean_steps", "object_set", "object_set_sha256",
@@ -75,7 +76,7 @@ def write_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write both files, each atomically; a row may lack columns."""
     complete = [dict.fromkeys(COLUMNS) | dict(row) for row in rows]
     write_jsonl(folder / RESULTS_FILE, complete)
-    write_csv(folder / "results.csv", COLUMNS, complete)
+    write_csv(folder / TABLE_FILE, COLUMNS, complete)
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ from graspq.common.options import INTERRUPTED, parse_count
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest
 from graspq.engine.plan import Ending, carry_out
 from graspq.evaluate.recipe_digest import of_a_recipe
+from graspq.evaluate.results_table import TABLE_FILE
 from graspq.studies.study.cells import Cell, by_dataset
 from graspq.studies.study.freezing import difference, require_frozen
 from graspq.studies.study.plan_file import StudyPlan
@@ -149,10 +150,11 @@ def references(plan: StudyPlan, cells: Sequence[Cell]) -> Iterator[Called]:
             words = ["--policy", policy, "--task", task, "--split", plan.split]
             words += ["--episodes", str(settings.episodes), "--seed", str(SCENES_SEED)]
             words += ["--objects", str(objects)] if objects is not None else []
-            words += ["--engine", settings.engine, "--out", str(settings.folder / "references")]
+            name = f"{policy.replace(':', '.')}-{task.replace(':', '.')}"
+            # A folder each: a table beside says of one policy alone whether its command came to the end.
+            words += ["--engine", settings.engine, "--out", str(settings.folder / "references" / name)]
             words += ["--ray-address", settings.ray_address] if settings.ray_address is not None else []
             words += ["--workers", "0"] if settings.workers == 0 else []
-            name = f"{policy.replace(':', '.')}-{task.replace(':', '.')}"
             yield Called(
                 f"scoring {policy} on {task} {plan.split}",
                 CommandLine("grasp-eval", tuple(words)),
@@ -162,7 +164,8 @@ def references(plan: StudyPlan, cells: Sequence[Cell]) -> Iterator[Called]:
 
 
 def _is_scored(plan: StudyPlan, folder: Path, policy: str, task: str) -> bool:
-    return reference(plan, folder, policy, task) is not None
+    found = reference(plan, folder, policy, task)
+    return found is not None and (found.folder.parent / TABLE_FILE).is_file()
 
 
 def check_runs(cells: Sequence[Cell]) -> None:

@@ -4,6 +4,8 @@ Goes on where it was stopped. Ends with results/faults.json and the table in RES
 """
 
 import argparse
+import os
+import subprocess
 import sys
 import time
 import types
@@ -18,7 +20,7 @@ if not hasattr(sys.modules.get("tests"), "__file__"):
     sys.modules["tests"] = tests
 
 from graspq.common.files import write_json, write_text  # noqa: E402
-from tests.faults.harness import GOOD, Log, Work, code_digest, rows_of, table, try_kind  # noqa: E402
+from tests.faults.harness import GOOD, MADE, Log, Work, code_digest, rows_of, table, try_kind  # noqa: E402
 from tests.faults.kinds import KINDS  # noqa: E402
 from tests.faults.planted import PLANTED, found_by  # noqa: E402
 from tests.faults.system_calls import shim  # noqa: E402
@@ -33,29 +35,54 @@ def main() -> int:
     parser.add_argument("--short", action="store_true", help="the few that `make test` tries; publishes nothing")
     parser.add_argument("--planted", action="store_true", help="plant defects, each of which must be found")
     parser.add_argument("--limit-minutes", type=float, default=float("inf"), help="stop after so long")
+    parser.add_argument(
+        "--workers", type=int, default=min(2, os.cpu_count() or 1), help="processes that share the work"
+    )
+    parser.add_argument("--part", type=int, help=argparse.SUPPRESS)  # of one of them
     given = parser.parse_args()
     until = time.monotonic() + 60 * given.limit_minutes
     folder = ROOT / "runs" / "faults"
+    part = (0, 1) if given.part is None else (given.part, given.workers)
     log, found = Log(folder / "tried.jsonl"), []
     with Work(folder / code_digest(), shim=shim(folder)) as work:
         if given.planted:
             return try_planted(work, given.kind)
+        if given.part is None and given.workers > 1:
+            share(work, given.workers)
+            log.read()
         for kind in KINDS:
             code = code_digest(Path(sys.modules[type(kind).__module__].__file__ or ""))
             if given.kind is None or any(name in kind.name for name in given.kind):
-                found += try_kind(kind, work, log, code, given.short, until)
+                found += try_kind(kind, work, log, code, given.short, until, part)
             else:
                 found += [
                     (fault, log.tried[fault][1])
                     for fault in log.tried
                     if fault.kind == kind.name and log.knows(fault, code)
                 ]
+    if given.part is not None:
+        return 0
     rows = rows_of(found)
     text = table(rows)
     print(text)
     if not given.short:
         publish(rows, text)
     return int(any(one.outcome not in GOOD for _, one in found))
+
+
+def share(work: Work, workers: int) -> None:
+    """Have processes of this program try what was not tried yet, each a part of it."""
+    for name in MADE:
+        work.made(name)
+    work.rest()
+    words = [sys.executable, "-P", str(Path(__file__).parent), *sys.argv[1:]]
+    parts = [subprocess.Popen([*words, "--workers", str(workers), "--part", str(part)]) for part in range(workers)]
+    try:
+        for one in parts:
+            one.wait()
+    finally:
+        for one in parts:
+            one.terminate()
 
 
 def try_planted(work: Work, kinds: list[str] | None) -> int:

@@ -25,6 +25,8 @@ from tests.faults.system_calls import (
     scenarios,
 )
 
+HALVES = 16  # writes of each command that are cut in half, evenly spread
+
 
 @dataclass
 class CrashPoints:
@@ -39,7 +41,7 @@ class CrashPoints:
         for scenario in scenarios(work, short):
             count = stage.unbroken(scenario).count(WRITE if self.half else CHANGES)
             numbers = range(1, count + 1)
-            for number in few(numbers, 1) if short else numbers:
+            for number in few(numbers, 1) if short else few(numbers, HALVES) if self.half else numbers:
                 yield Fault(self.name, scenario.command, f"{number}")
 
     def tried(self, fault: Fault, work: Work) -> Tried:

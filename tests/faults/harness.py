@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
 
+import filelock
+
 from graspq.common.text import markdown
 
 HERE = Path(__file__).resolve().parent
@@ -172,20 +174,33 @@ class Work:
         self._template: subprocess.Popen[str] | None = None
         self._own = self.folder / "cases" / str(os.getpid())  # two may work here at once
         self.inputs.mkdir(parents=True, exist_ok=True)
+        self._lock = filelock.FileLock(self.folder / "lock")
 
     def __enter__(self) -> "Work":
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.rest()
+        shutil.rmtree(self._own, ignore_errors=True)
+
+    def rest(self) -> None:
+        """End the process that commands are forked from; the next starts another."""
         if self._template is not None:
             assert self._template.stdin is not None
             self._template.stdin.close()
             self._template.wait()
             self._template = None
-        shutil.rmtree(self._own, ignore_errors=True)
 
     def made(self, name: str) -> Path:
         """Return an input, made with all that it needs if it is not there yet; to read only."""
+        with self.alone():
+            return self._made(name)
+
+    def alone(self) -> filelock.BaseFileLock:
+        """Return a lock that one process of those that share this folder holds at a time; it may enter it again."""
+        return self._lock
+
+    def _made(self, name: str) -> Path:
         note = self.inputs / f".{name}-made"
         order = list(MADE)
         if not note.exists():
@@ -379,15 +394,20 @@ class Log:
     tried: dict[Fault, tuple[str, Tried]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Read what is there; a line that a kill cut short is left out."""
+        """Read what is there."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.read()
+
+    def read(self) -> None:
+        """Read what is there, also what other processes have added; a line that a kill cut short is left out."""
         lines = self.path.read_text().split("\n")[:-1] if self.path.exists() else []
         for line in lines:
-            values = json.loads(line)
+            try:
+                values = json.loads(line)
+            except ValueError:
+                continue
             fault = Fault(values["kind"], values["command"], values["name"])
             self.tried[fault] = values["code"], Tried(values["outcome"], values["said"], values.get("cases", 1))
-        if self.path.exists():
-            self.path.write_text("".join(f"{line}\n" for line in lines))
 
     def knows(self, fault: Fault, code: str) -> bool:
         """Return whether it was tried with this code."""
@@ -399,15 +419,30 @@ class Log:
         values = {"kind": fault.kind, "command": fault.command, "name": fault.name, "code": code}
         values |= {"outcome": tried.outcome, "said": tried.said, "seconds": round(seconds, 2), "cases": tried.cases}
         with self.path.open("a") as file:
-            file.write(json.dumps(values) + "\n")
+            file.write(f"\n{json.dumps(values)}\n")  # on a line of its own, whatever a kill has left there
 
 
-def try_kind(kind: Kind, work: Work, log: Log, code: str, short: bool, until: float) -> list[tuple[Fault, Tried]]:
-    """Try the faults of a kind that were not tried yet, until the clock (`time.monotonic`) says `until`."""
+def try_kind(
+    kind: Kind, work: Work, log: Log, code: str, short: bool, until: float, part: tuple[int, int] = (0, 1)
+) -> list[tuple[Fault, Tried]]:
+    """Try the faults of a kind that were not tried yet; return all that were tried.
+
+    Args:
+        kind: the kind.
+        work: what they are tried on.
+        log: of what was tried before; gets the others.
+        code: see `code_digest`.
+        short: see `Kind.faults`.
+        until: when the clock (`time.monotonic`) says so, no other is begun.
+        part: number and count of the parts that processes share them in.
+    """
     found = []
-    for fault in kind.faults(work, short):
+    mine, parts = part
+    for number, fault in enumerate(kind.faults(work, short)):
         if time.monotonic() > until:
             break
+        if number % parts != mine:
+            continue
         if not log.knows(fault, code):
             start = time.monotonic()
             tried = kind.tried(fault, work)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 import struct
 import subprocess
@@ -21,7 +22,7 @@ NEVER = 0
 NO_COMPILER = "no C compiler (gcc or cc) here: system calls cannot be met"
 # Not compared: times stand in them, or in their names.
 TIMED = ("tensorboard", ".lock", "logs")
-SPEEDS = ("samples_per_second", "training_seconds", "seconds")
+SPEEDS = ("samples_per_second", "training_seconds", "seconds", "checksum")  # the last is of the others too
 
 
 @dataclass(frozen=True)
@@ -119,10 +120,9 @@ def shim(folder: Path) -> Path | None:
     if compiler is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    library = folder / "shim.so"
-    subprocess.run(
-        [compiler, "-O1", "-shared", "-fPIC", "-o", library, HERE / "shim.c", "-ldl", "-lpthread"], check=True
-    )
+    library, made = folder / "shim.so", folder / f"shim-{os.getpid()}.so"
+    subprocess.run([compiler, "-O1", "-shared", "-fPIC", "-o", made, HERE / "shim.c", "-ldl", "-lpthread"], check=True)
+    made.replace(library)  # in one step: another process may be at the same
     return library
 
 
@@ -181,6 +181,10 @@ class Stage:
 
     def start(self, scenario: Scenario) -> Path:
         """Return the working folder that a scenario begins in; to read only."""
+        with self._work.alone():
+            return self._start(scenario)
+
+    def _start(self, scenario: Scenario) -> Path:
         which = hashlib.sha256(repr(scenario).encode()).hexdigest()[:16]
         folder = self._work.folder / "starts" / which
         note = folder.with_name(f"{folder.name}-made")

@@ -55,8 +55,11 @@ def test_a_study_that_is_killed_goes_on_where_it_was_and_is_done_once(
 
     before = {path: sha256_of(path) for path in Path("study").rglob("eval.json")}
     assert len(before) == 7  # six runs and the random policy
+    (table_of_random,) = Path("study/references").rglob("results.csv")
+    table_of_random.unlink()  # as where it was killed just before
     assert grasp_study(*words, "--workers", "0") == 0
     assert "6 of 6 trainings finished before" in capfd.readouterr().err
+    assert table_of_random.is_file()
     Path("RESULTS.md").unlink()
     assert grasp_study("report", "tiny.toml", "--out", "elsewhere") == 0  # judged again without the runs
     assert Path("RESULTS.md").read_text() == page
