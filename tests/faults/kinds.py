@@ -17,7 +17,7 @@ KINDS: list[Kind] = [
     *failing_calls(),
     FullDisk(),
     ReadOnly(),
-    Limits("few open files (ulimit -n)", "RLIMIT_NOFILE", (64, 32, 24, 16)),
+    Limits("few open files (ulimit -n)", "RLIMIT_NOFILE", (64, 16, 10, 7)),
     Limits("little memory (ulimit -v), MiB above the start", "RLIMIT_AS", (64, 16, 256)),
     Bits(),
     Shards(),
