@@ -203,9 +203,7 @@ class Shards:
         self._other(case, work)
         (case / "other").rename(other)
         UNMIXABLE[what](other)
-        return work.forked(TRAIN.format(f"{DATA} {other.relative_to(case)}").split(), case).refused(
-            "cannot mix", "other"
-        )
+        return work.forked(TRAIN.format(f"{DATA} {other.relative_to(case)}").split(), case).refused("cannot mix")
 
     def _same(self, what: str, case: Path, work: Work) -> Tried:
         """Name the same shards in another way: the weights must be those of naming them once."""
