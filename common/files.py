@@ -5,6 +5,8 @@ After a crash at any moment a reader sees the old one or the new one, never a pa
 
 import contextlib
 import errno
+import fcntl
+import glob
 import hashlib
 import json
 import os
@@ -17,12 +19,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import filelock
 
 from graspq.common.errors import MachineError, UserError, failure_of_machine, naming
 
 TEMPORARY_PREFIX = ".tmp-"
+_NAME_BYTES = 160  # of the 255 of a name, beside a host's 64
 LOCK_NAME = ".lock"
+LOCK_SECONDS = 10.0  # more than the engine gives a worker whose parent is gone
 
 
 def sha256_of(path: Path) -> str:
@@ -127,13 +132,19 @@ def remove_folder(path: Path) -> None:
 
 
 def _temporary(path: Path) -> Path:
-    return path.parent / f"{TEMPORARY_PREFIX}{socket.gethostname()}-{os.getpid()}-{path.name}"
+    return path.parent / f"{TEMPORARY_PREFIX}{socket.gethostname()}-{os.getpid()}-{_short(path.name)}"
+
+
+def _short(name: str) -> str:
+    """Return a name that leaves room for what stands before it: a file's may have 255 bytes."""
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    return name if len(os.fsencode(name)) <= _NAME_BYTES else digest
 
 
 def _remove_orphans(path: Path) -> None:
     """Remove what writers of `path` that were killed on this machine have left beside it."""
     mine = f"{TEMPORARY_PREFIX}{socket.gethostname()}-"
-    for leftover in path.parent.glob(f"{mine}*-{path.name}*"):
+    for leftover in path.parent.glob(f"{glob.escape(mine)}*-{glob.escape(_short(path.name))}*"):
         owner = leftover.name.removeprefix(mine).split("-")[0]
         if owner.isdigit() and not _alive(int(owner)):
             _remove(leftover)
@@ -153,18 +164,23 @@ def _alive(process: int) -> bool:
 def locked(folder: Path, what: str) -> Iterator[None]:
     """Hold `folder` for this process alone; a process that is killed holds nothing any more.
 
-    The lock is the library filelock's, which PyTorch needs anyway: flock on an empty file `.lock` that stays there.
+    The lock is the library filelock's, which PyTorch needs anyway: flock on an empty file `.lock` that stays there. A
+    worker whose parent was killed holds its folder until it has kept what it has: it is waited for, `LOCK_SECONDS`.
 
     Args:
         folder: the folder, which is there and can be written to.
         what: what works in it, such as `"grasp-datagen"`.
 
     Raises:
-        UserError: another process holds it.
+        UserError: another process holds it all that time, or it cannot be locked.
     """
-    lock = filelock.FileLock(folder / LOCK_NAME, timeout=0)
+    lock = filelock.FileLock(folder / LOCK_NAME)
     try:
-        lock.acquire()
+        try:
+            lock.acquire(timeout=0)
+        except filelock.Timeout:
+            click.echo(f"{folder}: another {what} works here; waiting {LOCK_SECONDS:g} s for its end", err=True)
+            lock.acquire(timeout=LOCK_SECONDS)
     except filelock.Timeout:
         raise UserError(
             f"{folder}: another {what} works here; wait for its end, or choose another folder with --out"
@@ -175,6 +191,69 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextlib.contextmanager
+def temporary_folder(what: str, path_bytes: int = 4000) -> Iterator[Path]:
+    """Yield a new private folder for temporary files, which is removed on leaving.
+
+    Those of this user's processes that were killed before they could do so are removed now. Whether the process of one
+    is gone its lock tells, which ends with the process, however that ends.
+
+    Args:
+        what: it is for, such as `"workers"`; part of its name.
+        path_bytes: its path has at most so many bytes, for sockets; in `/tmp` where $TMPDIR is too long for that.
+
+    Raises:
+        UserError: there is no folder for temporary files that can be written to.
+    """
+    prefix, place = f"graspq-{what}-", Path("/tmp")
+    try:
+        usual = Path(tempfile.gettempdir())
+        place = usual if len(os.fsencode(usual / prefix)) + 8 <= path_bytes else place
+        for leftover in place.glob(f"{glob.escape(prefix)}*"):
+            _remove_forsaken(leftover)
+        while True:
+            folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+            held = _held(folder)
+            if held is not None:
+                if folder.exists():
+                    break
+                os.close(held)  # one that sweeps was faster
+    except OSError as error:
+        raise UserError(f"{place}: cannot write temporary files here ({error.strerror}); set TMPDIR") from None
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
+
+
+def _held(folder: Path) -> int | None:
+    """Return a descriptor that locks a folder, or None where another process holds it, or it is gone."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _remove_forsaken(folder: Path) -> None:
+    try:
+        found = folder.lstat()
+    except OSError:
+        return
+    if found.st_uid != os.getuid() or not stat.S_ISDIR(found.st_mode):
+        return
+    held = _held(folder)
+    if held is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
 
 
 def cache_folder(*parts: str) -> Path:

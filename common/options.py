@@ -19,11 +19,23 @@ import click
 
 import graspq
 from graspq.common.errors import UserError, failure_of_machine
+from graspq.common.streams import (
+    give_up_streams,
+    interrupts_without_traceback,
+    next_interrupt_ends_at_once,
+    readers_are_gone,
+    require_names_of_text,
+    whole_streams,
+)
 
 S = TypeVar("S", bound="Settings")
 INTERRUPTED = 130
 LONGEST = 2000  # letters of a message: what it quotes may be a file
 MOST = 10**9  # of anything that is counted; what is made for each fits in memory
+
+# Here, because the modules of commands import this one before what takes seconds.
+if Path(sys.argv[0]).name.startswith("grasp-"):
+    interrupts_without_traceback()
 
 
 def setting(
@@ -323,9 +335,12 @@ class _OneLineErrors:
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> Any:
         """Run the command and exit; see the class."""
         extra.pop("standalone_mode", None)
+        whole_streams()
         try:
+            require_names_of_text(sys.argv[1:] if args is None else args)
             result = super().main(args=args, prog_name=prog_name, standalone_mode=False, **extra)  # type: ignore[misc]
         except click.exceptions.Abort:
+            next_interrupt_ends_at_once()
             click.echo("interrupted", err=True)
             sys.exit(INTERRUPTED)
         except click.UsageError as error:
@@ -335,9 +350,6 @@ class _OneLineErrors:
         except click.ClickException as error:
             click.echo(f"error: {_one_line(error.format_message())}", err=True)
             sys.exit(error.exit_code)
-        except BrokenPipeError:
-            sys.stderr.close()
-            sys.exit(1)
         except (OSError, MemoryError, RuntimeError) as error:
             failure = failure_of_machine(error)
             if failure is None:
@@ -345,6 +357,17 @@ class _OneLineErrors:
             click.echo(f"error: {_one_line(failure.message)}", err=True)
             sys.exit(failure.exit_code)
         sys.exit(result if isinstance(result, int) else 0)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; where nobody reads what it says any more, it ends without a word, as others do."""
+        try:
+            return super().invoke(ctx)  # type: ignore[misc]
+        except BrokenPipeError as error:
+            if not readers_are_gone():
+                # click would take it for that.
+                raise RuntimeError("a pipe to another process is broken") from error
+            give_up_streams()
+            sys.exit(1)
 
 
 def _one_line(message: str) -> str:

@@ -111,7 +111,7 @@ def readable(what: object) -> Iterator[None]:
 
 
 def read_block(
-    ref: BlockRef, image_shape: tuple[int, int, int], dtype: RecordType, metadata: Any = None
+    ref: BlockRef, image_shape: tuple[int, int, int], dtype: RecordType, metadata: Any = None, content: Any = None
 ) -> BlockArrays:
     """Return the rows of a block.
 
@@ -120,13 +120,14 @@ def read_block(
         image_shape: (H, W, C).
         dtype: of the records, see `columns.record_dtype`.
         metadata: the file's footer where it was read before.
+        content: the file's bytes where they are in memory.
 
     Raises:
         UserError: the file is missing, truncated or damaged; the message names the file and the block.
     """
     names = (dtype.names or ())[:-1]
     with readable(f"{ref.path}: block {ref.block}"):
-        table = _row_group(ref, [*names, "image"], metadata)
+        table = _row_group(ref, [*names, "image"], metadata, content)
         images = from_arrow(only(table.column("image")), image_shape)
         records = np.zeros(len(images), dtype)
         for name in names:
@@ -140,26 +141,28 @@ def read_block(
     return BlockArrays(ref.block, images, records, first_rows, lengths)
 
 
-def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None) -> dict[str, Any]:
+def read_columns(ref: BlockRef, names: Sequence[str], metadata: Any = None, content: Any = None) -> dict[str, Any]:
     """Return some columns of a block as numpy arrays, [N] or [N, ...], without reading the others.
 
     Args:
         ref: the block.
         names: of columns of the steps table, not the image.
         metadata: the file's footer where it was read before.
+        content: the file's bytes where they are in memory.
 
     Raises:
         UserError: the file is missing, truncated or damaged; the message names the file and the block.
     """
     with readable(f"{ref.path}: block {ref.block}"):
-        table = _row_group(ref, list(names), metadata)
+        table = _row_group(ref, list(names), metadata, content)
         return {name: to_numpy(table.column(name)) for name in names}
 
 
-def _row_group(ref: BlockRef, names: list[str], metadata: Any) -> pa.Table:
+def _row_group(ref: BlockRef, names: list[str], metadata: Any, content: Any) -> pa.Table:
     # Reading ahead by threads of Arrow's gains nothing here: a block is read whole, and several are at a time.
     options = {"page_checksum_verification": True, "memory_map": False, "pre_buffer": False}
-    with pq.ParquetFile(ref.path, metadata=metadata, **options) as file:
+    source = ref.path if content is None else pa.BufferReader(content)
+    with pq.ParquetFile(source, metadata=metadata, **options) as file:
         return file.read_row_group(ref.row_group, columns=names, use_threads=False)
 
 

@@ -57,6 +57,24 @@ class Shard:
         """Its episodes table."""
         return self.folder / episodes_file(self.entry.name)
 
+    @property
+    def may_grow(self) -> bool:
+        """Whether a larger dataset in the same folder would replace it: the last one, if it is not whole."""
+        whole = int(self.manifest.settings.get("blocks_per_shard", 0)) * self.manifest.block_size
+        return self.entry == self.manifest.shards[-1] and self.entry.episodes < whole
+
+    def content(self) -> bytes:
+        """Return the bytes of its steps table.
+
+        Raises:
+            UserError: it is missing or damaged.
+        """
+        with readable(f"{self.steps}:"):
+            content = self.steps.read_bytes()
+        if hashlib.sha256(content).hexdigest() != self.entry.files[steps_file(self.entry.name)]:
+            raise UserError(f"{self.steps}: damaged, its SHA-256 is not that of the manifest; {REMEDY}")
+        return content
+
     def check(self, path: Path, verify: bool = True) -> None:
         """Check one of its two files against the manifest: its size, and its SHA-256 where `verify` says so.
 
@@ -156,7 +174,25 @@ def open_shards(patterns: Sequence[str | Path], verify: bool = True) -> ShardPoo
     """
     if not patterns:
         raise UserError("shards: expected dataset folders, shard files or globs, got none")
-    opened: dict[Path, list[Shard]] = {}
+    while True:
+        opened: dict[Path, list[Shard]] = {}
+        try:
+            return _opened(patterns, verify, opened)
+        except UserError:
+            # A dataset that is being extended loses its last shard to a longer one, at any moment.
+            if not any(has_changed(shards[0].folder, shards[0].manifest) for shards in opened.values() if shards):
+                raise
+
+
+def has_changed(folder: Path, manifest: Manifest) -> bool:
+    """Return whether a dataset has another manifest by now: it is being extended."""
+    try:
+        return Manifest.load(folder).digest() != manifest.digest()
+    except UserError:
+        return False
+
+
+def _opened(patterns: Sequence[str | Path], verify: bool, opened: dict[Path, list[Shard]]) -> ShardPool:
     found = [shard for pattern in patterns for path in _matches(str(pattern)) for shard in _shards(path, opened)]
     # By content: a copy of a shard under another name is the same shard; the one named first counts.
     once = {(shard.entry.files[steps_file(shard.entry.name)], shard.entry.first_block): shard for shard in found[::-1]}
@@ -205,6 +241,8 @@ def _pool(shards: list[Shard], verify: bool) -> ShardPool:
     with ThreadPoolExecutor(HASHING_THREADS) as executor:
         list(executor.map(lambda shard: shard.check(shard.steps, verify), shards))
     footers = {shard.steps: shard.footer() for shard in shards}
+    # They are a few megabytes at most, and their files go when the dataset is extended while they are read.
+    contents = {shard.steps: shard.content() for shard in shards if shard.may_grow}
     manifest = shards[0].manifest
     whole = len(shards) == len(manifest.shards) and len({id(shard.manifest) for shard in shards}) == 1
     digests = "".join(shard.entry.files[steps_file(shard.entry.name)] for shard in shards)
@@ -217,6 +255,7 @@ def _pool(shards: list[Shard], verify: bool) -> ShardPool:
         object_set=manifest.object_set,
         manifest_digest=manifest.digest() if whole else hashlib.sha256(digests.encode()).hexdigest(),
         _footers=footers,
+        _contents=contents,
     )
 
 

@@ -248,10 +248,13 @@ class Manifest:
         )
 
     def with_shard(self, entry: ShardEntry) -> "Manifest":
-        """Return the manifest with `entry` added; it takes the place of one that starts at the same block."""
+        """Return the manifest with `entry` added; it takes the place of one that starts at the same block.
+
+        The dataset card is of the dataset as it was: it is listed again when it is written again.
+        """
         others = [other for other in self.shards if other.first_block != entry.first_block]
         shards = sorted([*others, entry], key=lambda shard: shard.first_block)
-        return dataclasses.replace(self, shards=tuple(shards))
+        return dataclasses.replace(self, shards=tuple(shards), files={})
 
 
 def _check_kinds(manifest: Manifest) -> None:

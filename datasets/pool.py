@@ -57,6 +57,7 @@ class ShardPool:
     object_set: dict[str, Any]
     manifest_digest: str
     _footers: dict[Path, Any] = field(default_factory=dict)
+    _contents: dict[Path, bytes] = field(default_factory=dict)
     _relabels: bool = False
 
     @property
@@ -139,12 +140,15 @@ class ShardPool:
 
     def read_block(self, ref: BlockRef) -> BlockArrays:
         """Return the rows of a block; see `blocks.read_block`. Safe to call from several threads."""
-        block = read_block(ref, self.image_shape, self._record, self._footers.get(ref.path))
+        block = read_block(ref, self.image_shape, self._record, *self._known(ref))
         return block.with_discount(self.discount) if self._relabels else block
 
     def read_columns(self, ref: BlockRef, names: Sequence[str]) -> dict[str, Any]:
         """Return some stored columns of a block; see `blocks.read_columns`."""
-        return read_columns(ref, names, self._footers.get(ref.path))
+        return read_columns(ref, names, *self._known(ref))
+
+    def _known(self, ref: BlockRef) -> tuple[Any, bytes | None]:
+        return self._footers.get(ref.path), self._contents.get(ref.path)
 
     def with_discount(self, discount: float) -> "ShardPool":
         """Return the same grasps with `mc_return` for another γ in [0, 1], made from the rewards."""

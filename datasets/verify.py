@@ -16,7 +16,7 @@ from graspq.common.errors import UserError
 from graspq.common.files import LOCK_NAME, read_json, sha256_of
 from graspq.datasets.blocks import BlockRef, read_block
 from graspq.datasets.columns import record_dtype, wrong_labels
-from graspq.datasets.dataset import Shard
+from graspq.datasets.dataset import Shard, has_changed
 from graspq.datasets.images import decoded
 from graspq.datasets.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from graspq.datasets.tables import episodes_schema, steps_schema
@@ -62,7 +62,7 @@ class Checking:
 
 
 def verify(folder: Path | str, progress: Progress = lambda _: None, workers: int | None = 0) -> Report:
-    """Check a whole dataset.
+    """Check a whole dataset; one that is extended meanwhile is checked again if a fault was found.
 
     Args:
         folder: the dataset.
@@ -73,7 +73,14 @@ def verify(folder: Path | str, progress: Progress = lambda _: None, workers: int
         UserError: the folder is no dataset, or its manifest is damaged.
     """
     folder = Path(folder)
-    manifest = Manifest.load(folder)
+    while True:
+        manifest = Manifest.load(folder)
+        report = _verified(folder, manifest, progress, workers)
+        if not report.faults or not has_changed(folder, manifest):
+            return report
+
+
+def _verified(folder: Path, manifest: Manifest, progress: Progress, workers: int | None) -> Report:
     faults = [*_named_files(folder, manifest), *_object_files(folder, manifest)]
     engine = EngineSettings(workers=workers if len(manifest.shards) > 1 else 0)
     by_shard: dict[str, list[str]] = {}

@@ -6,6 +6,7 @@ threads, which has imported what they need, forks them at once.
 
 import concurrent.futures
 import contextlib
+import functools
 import multiprocessing
 import multiprocessing.forkserver
 import multiprocessing.util
@@ -22,11 +23,16 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+from graspq.common.errors import UserError
+from graspq.common.files import temporary_folder
 from graspq.engine import server
 from graspq.engine.work import Bench, Died, Failed, Outcome
 
 GRACE_SECONDS = 30.0
 ORPHAN_SECONDS = 3.0
+_SOCKET_ROOM = 80  # the path of a socket may have 107 bytes, its name in the folder has 18
+_SERVERS_ALLOWED = 3
+_SERVER_GONE = 255  # what multiprocessing says of a process whose server was killed
 _bench: Bench | None = None
 
 
@@ -36,12 +42,22 @@ def warm_up(modules: Sequence[str]) -> None:
     It ends with this process. Once it runs, this does nothing.
     """
     multiprocessing.set_forkserver_preload([server.__name__, *modules])
-    os.environ[server.FOLDER] = multiprocessing.util.get_temp_dir()
+    os.environ[server.FOLDER] = str(_sockets_folder())
     try:
         with _interrupts_blocked():
             multiprocessing.forkserver.ensure_running()
     finally:
         del os.environ[server.FOLDER]
+
+
+@functools.cache
+def _sockets_folder() -> Path:
+    """Have multiprocessing keep its sockets in a folder of ours, whose leftovers can be told from those of others."""
+    opened = contextlib.ExitStack()
+    folder = opened.enter_context(temporary_folder("workers", _SOCKET_ROOM))
+    multiprocessing.util.Finalize(None, opened.close, exitpriority=-100)
+    multiprocessing.current_process()._config["tempdir"] = str(folder)  # type: ignore[attr-defined]
+    return folder
 
 
 class LocalWorker:
@@ -50,22 +66,34 @@ class LocalWorker:
     ready = True
 
     def __init__(self, work: bytes) -> None:
-        """Start it; it opens the pickled work with its first unit."""
+        """Prepare it; it opens the pickled work with its first unit."""
         context = multiprocessing.get_context("forkserver")
         # The server has the environment of its own start.
         begin = (work, dict(os.environ))
-        self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=begin)
-        before = set(multiprocessing.active_children())
+        self._executor: Any = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=begin)
+        # The executor puts its process there, and forgets this dictionary in the end.
+        self._of_executor: Any = self._executor._processes
+
+    @property
+    def _processes(self) -> list[Any]:
+        return list(self._of_executor.values())
+
+    def start(self) -> None:
+        """Start the process.
+
+        Raises:
+            EOFError, ConnectionError: the server was killed at that moment.
+        """
         with _interrupts_blocked():
             self._executor.submit(int)  # the executor starts its process with the first thing to do
-        self._processes = set(multiprocessing.active_children()) - before
         # Only the process itself holds the writing end: killed in the midst of a result it ends the pipe, and the
         # executor's thread that reads there does not wait for the rest for ever.
-        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
+        self._executor._result_queue._writer.close()
 
     def submit(self, unit: Any) -> "Future[Outcome[Any]]":
         """Give it a unit."""
-        return self._executor.submit(_do, unit)
+        future: Future[Outcome[Any]] = self._executor.submit(_do, unit)
+        return future
 
     def outcome(self, future: "Future[Outcome[Any]]") -> Outcome[Any]:
         """Return what came of a unit; the worker is gone where it died."""
@@ -74,13 +102,24 @@ class LocalWorker:
         except BrokenProcessPool:
             self.end()
             codes = {process.exitcode for process in self._processes} - {None}
+            if _SERVER_GONE in codes:
+                for number in filter(None, (process.pid for process in self._processes)):
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(number, signal.SIGKILL)  # it may live on, and hold what another will be given
             return Died(_how(next(iter(codes), None)))
         except BaseException as error:  # such as a unit that cannot be pickled
             return Failed(f"{type(error).__name__}: {error}")
 
     def end(self) -> None:
-        """End an idle process, or wait for the end of one that was asked."""
-        self._executor.shutdown(wait=True, cancel_futures=True)
+        """End an idle process, or wait for the end of one that was asked; one that was stopped (SIGSTOP) is killed."""
+        manager, processes = self._executor._executor_manager_thread, self._processes
+        self._executor.shutdown(wait=False, cancel_futures=True)
+        if manager is not None:
+            manager.join(GRACE_SECONDS)
+            if manager.is_alive():
+                for process in processes:
+                    process.kill()
+                manager.join()
 
     def ask_to_end(self) -> None:
         """Send SIGTERM: a unit that handles it, such as a training, may keep what it has; all others end at once."""
@@ -106,10 +145,22 @@ class LocalTeam:
         self._busy: dict[Future[Outcome[Any]], LocalWorker] = {}
 
     def hire(self) -> LocalWorker:
-        """Start a process."""
-        worker = LocalWorker(self._work)
-        self._workers.append(worker)
-        return worker
+        """Start a process.
+
+        Raises:
+            UserError: the server that forks it was killed several times.
+        """
+        for _ in range(_SERVERS_ALLOWED):
+            worker = LocalWorker(self._work)
+            # Ours before it starts: an interruption in the midst leaves none that nobody ends.
+            self._workers.append(worker)
+            try:
+                worker.start()
+            except (EOFError, ConnectionError):  # the next one has a new server
+                self._workers.remove(worker)
+                continue
+            return worker
+        raise UserError("workers cannot start: what forks them is killed each time; run the same command again")
 
     def give(self, worker: LocalWorker, unit: Any) -> bool:
         """Give a unit to an idle worker; return False where it has died."""

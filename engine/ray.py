@@ -9,12 +9,12 @@ import os
 import shutil
 import socket
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
+from graspq.common.files import temporary_folder
 from graspq.common.machine import available_cores
 from graspq.engine.shipping import digest_of, packed, received
 from graspq.engine.work import Bench, Died, Failed, Outcome, Work
@@ -40,7 +40,7 @@ def connected(address: str | None, workers: int | None, cpus_per_worker: int) ->
         cpus_per_worker: cores of each.
 
     Raises:
-        UserError: there is no such cluster, or it has no free core.
+        UserError: there is no such cluster, it has no free core, or it fails.
     """
     with contextlib.ExitStack() as stack:
         if not ray.is_initialized():
@@ -50,7 +50,11 @@ def connected(address: str | None, workers: int | None, cpus_per_worker: int) ->
             raise UserError(
                 f"--ray-address: the cluster has {cores} CPUs, a worker needs {cpus_per_worker}; add nodes to it"
             )
-        yield workers if workers is not None else cores // cpus_per_worker
+        try:
+            yield workers if workers is not None else cores // cpus_per_worker
+        except RayError as error:  # such as a full object store, or a head that is gone
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise UserError(f"--engine ray: Ray failed ({reason}); the same command goes on once it works") from None
 
 
 _QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
@@ -102,16 +106,15 @@ sleep 0.5; rm -rf -- "$0"
 @contextlib.contextmanager
 def _removed_in_any_case() -> Iterator[Path]:
     """Yield a temporary folder that goes when this process ends, even by SIGKILL, and with it what works in it."""
-    place = Path(tempfile.gettempdir())
-    folder = Path(tempfile.mkdtemp(prefix="graspq-ray-", dir=place if len(str(place)) < _SOCKET_ROOM - 20 else "/tmp"))
-    words = ["sh", "-c", _SWEEPER, str(folder)]
-    sweeper = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        sweeper.kill()
-        sweeper.wait()
+    with temporary_folder("ray", _SOCKET_ROOM) as folder:
+        words = ["sh", "-c", _SWEEPER, str(folder)]
+        sweeper = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            sweeper.kill()
+            sweeper.wait()
 
 
 class RayWorker:

@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from graspq.common.errors import UserError
-from graspq.common.files import writable_folder
+from graspq.common.files import LOCK_NAME, locked, remove_temporaries, writable_folder
 from graspq.common.named_objects import source_digest
 from graspq.common.options import flag
 from graspq.common.provenance import code_revision, versions
@@ -193,23 +193,33 @@ def _place(job: Job, task: str, out: Path | None, identity: dict[str, Any], take
 def run_prepared(
     prepared: Prepared, settings: EvalSettings, on_row: Callable[[EpisodeRow], None] | None = None
 ) -> Evaluation:
-    """Run a prepared job and write its files.
+    """Run a prepared job and write its files; one that another process has finished meanwhile is returned.
 
     Raises:
-        UserError: the folder cannot be written, a user's policy fails, or episodes end their simulators each time.
+        UserError: the folder cannot be written, another process works there or has put another evaluation there, a
+            user's policy fails, or episodes end their simulators each time.
     """
     folder = writable_folder(prepared.folder, "evaluation")
-    try:
-        rows, films = run_rollouts(
-            prepared.rollouts, prepared.job.episodes, settings.where, films=settings.films, on_row=on_row
-        )
-    except BaseException:
-        with contextlib.suppress(OSError):
-            folder.rmdir()  # only if it is empty: nothing of an unfinished evaluation stays
-        raise
-    write_rows(folder, rows)
-    write_films(folder, films)
-    return write_summary(folder, _summary(prepared, rows))
+    with locked(folder, "grasp-eval"):
+        remove_temporaries(folder)
+        there = finished_in(folder)
+        if there is not None and there.summary["job"] != prepared.identity:
+            raise UserError(f"{folder}: another evaluation has come here meanwhile; run the same command again")
+        if there is not None and not settings.again:
+            return there
+        try:
+            rows, films = run_rollouts(
+                prepared.rollouts, prepared.job.episodes, settings.where, films=settings.films, on_row=on_row
+            )
+        except BaseException:
+            if [path.name for path in folder.iterdir()] == [LOCK_NAME]:  # nothing of an unfinished one stays
+                with contextlib.suppress(OSError):
+                    (folder / LOCK_NAME).unlink()
+                    folder.rmdir()
+            raise
+        write_rows(folder, rows)
+        write_films(folder, films)
+        return write_summary(folder, _summary(prepared, rows))
 
 
 def _summary(prepared: Prepared, rows: Sequence[EpisodeRow]) -> dict[str, Any]:

@@ -148,7 +148,7 @@ class Evaluation:
         if not self.has(EPISODES_FILE):
             raise DamagedError(f"{path}: damaged or missing, not the rows that {EVAL_FILE} names; {REMEDY}")
         try:
-            return [EpisodeRow.from_json(json.loads(line)) for line in path.read_text().splitlines()]
+            return [EpisodeRow.from_json(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DamagedError(f"{path}: not the rows of an evaluation ({error!r}); {REMEDY}") from None
 

@@ -31,6 +31,7 @@ def default_object_set(name: str) -> ObjectSet:
     if name not in _MAKERS:
         raise UserError(f"object set {name!r}: choose from {', '.join(_MAKERS)}, or name a folder with --objects")
     folder = cache_folder("objects", f"{name}-{GENERATOR_VERSION}")
+    stale = folder.exists() or folder.is_symlink()
     try:
         there = ObjectSet.load(folder)
         if (there.generator_version, there.seed) == (GENERATOR_VERSION, SEED):
@@ -39,9 +40,9 @@ def default_object_set(name: str) -> ObjectSet:
         raise
     except UserError:
         pass
-    if folder.is_dir() and not folder.is_symlink():
+    if stale and folder.is_dir() and not folder.is_symlink():
         shutil.rmtree(folder)
-    else:
+    elif stale:  # else another process may have made it just now
         folder.unlink(missing_ok=True)
     click.echo(f"making the {name} object set in {folder} (once)", file=sys.stderr)
     return _MAKERS[name](folder)

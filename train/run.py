@@ -69,10 +69,9 @@ class Run:
         Raises:
             UserError: the folder holds something else or a run of another configuration, or cannot be written.
         """
+        _refuse_something_else(folder)
         writable_folder(folder, "run")
         if not (folder / "config.json").exists():
-            if any(not path.name.startswith(".") for path in folder.iterdir()):
-                raise UserError(f"{folder}: not empty and not a training run; choose another folder with --out")
             write_checked_json(folder / "config.json", config)
             return cls(folder, config)
         run = cls.open(folder)
@@ -95,17 +94,22 @@ class Run:
                     "choose another folder with --out, or delete it"
                 )
 
+    @classmethod
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the run for this process alone, and remove what killed writers left.
+    def held(cls, folder: Path, config: dict[str, Any], free: frozenset[str]) -> Iterator["Run"]:
+        """Hold a folder for this process alone, remove what killed writers left, and yield its run.
+
+        Of two that begin in one folder, the second finds the configuration of the first.
 
         Raises:
-            UserError: another process trains in it.
+            UserError: another process trains in it; or see `create_or_resume`.
         """
-        with locked(self.folder, "training"):
-            remove_temporaries(self.folder)
-            remove_temporaries(self.checkpoints_folder)
-            yield
+        _refuse_something_else(folder)
+        with locked(writable_folder(folder, "run"), "training"):
+            run = cls.create_or_resume(folder, config, free)
+            remove_temporaries(run.folder)
+            remove_temporaries(run.checkpoints_folder)
+            yield run
 
     @property
     def checkpoints_folder(self) -> Path:
@@ -207,6 +211,14 @@ def _is_configuration(config: dict[str, Any]) -> bool:
     shards = settings.get("shards", [])
     listed = isinstance(shards, list) and all(isinstance(shard, str) for shard in shards)
     return listed and all(isinstance(part, dict) for part in parts)
+
+
+def _refuse_something_else(folder: Path) -> None:
+    """Refuse a folder that holds other things than a run, before anything is written to it."""
+    if not folder.is_dir() or (folder / "config.json").exists():
+        return
+    if any(not path.name.startswith(".") for path in folder.iterdir()):
+        raise UserError(f"{folder}: not empty and not a training run; choose another folder with --out")
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class RunLog:
         with naming(self._folder):
             self._writer = SummaryWriter(str(self._folder), purge_step=step + 1) if writes else None
         # A log file gets a line every half minute instead of a moving bar.
-        interval = 0.5 if sys.stderr.isatty() else 30.0
+        interval = 0.5 if sys.stderr is not None and sys.stderr.isatty() else 30.0
         self._bar = tqdm(
             total=settings.last_step,
             initial=step,

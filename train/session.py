@@ -150,8 +150,7 @@ def session(
     with contextlib.ExitStack() as stack:
 
         def opened() -> tuple[Run, Path | None]:
-            run = Run.create_or_resume(settings.run_folder, config, FREE)
-            stack.enter_context(run.locked())
+            run = stack.enter_context(Run.held(settings.run_folder, config, FREE))
             return run, newest_whole(run)
 
         if ranks.first and config["mc_return"].startswith("made"):

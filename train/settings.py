@@ -22,7 +22,7 @@ from graspq.train.recipe import Recipe
 Preset = Literal["default", "paper"]
 NESTED = ("own", "network_own")
 # Options of the command that are no settings.
-COMMAND_OPTIONS = frozenset({"preset", "help", "version"})
+COMMAND_OPTIONS = frozenset({"preset", "help", "version", "verify_replay"})
 # Settings that may differ when a run is resumed: they do not decide what is learned. Of shards the digest is compared.
 FREE = frozenset({"shards", "out", "save_every", "device", "precision", "resident", "threads"})
 

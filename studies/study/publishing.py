@@ -62,7 +62,7 @@ def publish(
     if page is not None:
         files = [Path(os.path.relpath(path, page.parent)) for path in (scores, *figures)]
         text = section(study, plan, table, beside, files, reference)
-        write_text(page, with_section(page.read_text() if page.exists() else "", study, text))
+        write_text(page, with_section(page.read_text(encoding="utf-8") if page.exists() else "", study, text))
         written.append(page)
     return written
 

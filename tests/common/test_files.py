@@ -2,6 +2,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +18,7 @@ from graspq.common.files import (
     remove_folder,
     remove_temporaries,
     sha256_of,
+    temporary_folder,
     writable_folder,
     write_json,
 )
@@ -144,7 +148,8 @@ with committed(Path(sys.argv[1])) as temporary:
     assert {entry.name for entry in tmp_path.iterdir()} == {"file", of_the_living.name}
 
 
-def test_one_process_holds_a_folder_and_a_killed_one_holds_nothing(tmp_path):
+def test_one_process_holds_a_folder_and_a_killed_one_holds_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("graspq.common.files.LOCK_SECONDS", 0.1)
     code = """
 import sys, time
 from pathlib import Path
@@ -160,6 +165,59 @@ with locked(Path(sys.argv[1]), "holder"):
         holder.kill()
     with locked(tmp_path, "grasp-datagen"), pytest.raises(UserError), locked(tmp_path, "grasp-datagen"):
         pass
+    waited = f"{tmp_path}: another grasp-datagen works here; waiting 0.1 s for its end"
+    assert capsys.readouterr().err.splitlines() == [waited, waited]
+
+
+def test_a_folder_that_is_let_go_soon_is_waited_for(tmp_path, capsys):
+    holding = locked(tmp_path, "first")
+    holding.__enter__()
+    timer = threading.Timer(0.3, holding.__exit__, (None, None, None))
+    started = time.monotonic()
+    timer.start()
+    with locked(tmp_path, "second"):
+        assert 0.2 < time.monotonic() - started < 8
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_temporary_folders_of_killed_processes_are_removed_by_the_next_and_no_others(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    code = """
+import os, signal, sys, time
+from graspq.common.files import temporary_folder
+with temporary_folder("workers") as folder:
+    print(folder, flush=True)
+    sys.stdin.read(1) or os.kill(os.getpid(), signal.SIGKILL)
+"""
+    (tmp_path / "graspq-workers-file").write_text("of somebody")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "graspq-workers-link").symlink_to(tmp_path / "elsewhere")
+    kept = {"graspq-workers-file", "elsewhere", "graspq-workers-link"}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    ) as other:  # fmt: skip
+        theirs = Path(other.stdout.readline().strip())
+        with temporary_folder("workers") as ours:
+            assert theirs.is_dir() and ours.parent == theirs.parent and ours.stat().st_mode & 0o777 == 0o700
+        assert not ours.exists()
+        other.stdin.close()
+    assert other.returncode == -signal.SIGKILL and theirs.is_dir()
+    with temporary_folder("workers") as ours:
+        assert {path.name for path in tmp_path.iterdir()} == kept | {ours.name}
+    assert {path.name for path in tmp_path.iterdir()} == kept
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / ("x" * 100)))
+    with temporary_folder("workers", 80) as ours:
+        assert ours.parent == Path("/tmp")
+
+
+def test_a_name_of_two_hundred_letters_leaves_room_for_a_temporary_one(tmp_path):
+    for name in ("n" * 230, "[a]*?"):
+        with committed_folder(tmp_path / name) as temporary:
+            (temporary / "file").touch()
+        remove_folder(tmp_path / name)
+        write_json(tmp_path / name, 1)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_the_cache_is_where_the_user_says_and_private_where_home_is_not_to_be_written(tmp_path, monkeypatch):

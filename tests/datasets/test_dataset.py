@@ -36,6 +36,47 @@ def test_a_short_last_block_has_its_own_number_of_episodes(drawn, tmp_path):
     assert len(pool.read_block(pool.blocks[2]).lengths) == 1
 
 
+def test_a_pool_outlives_the_extension_of_its_dataset(drawn, tmp_path):
+    manifest = drawn.manifest(block_size=3)
+    manifest = dataclasses.replace(manifest, settings={**manifest.settings, "blocks_per_shard": 3})
+    episodes = [drawn.episode(index, 3) for index in range(18)]
+    manifest = commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 3, episodes[:9]))
+    for count in (10, 15):
+        manifest = commit_shard(
+            tmp_path, manifest, write_shard(tmp_path, manifest, 3, -(-count // 3) - 3, episodes[9:count])
+        )
+        pool = open_shards([tmp_path])
+        last = pool.blocks[-1]
+        before = pool.read_block(last)
+        manifest = commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 3, 3, episodes[9:18]))
+        assert not last.path.exists()
+        after = pool.read_block(last)
+        assert np.array_equal(after.images, before.images) and np.array_equal(after.records, before.records)
+        assert np.array_equal(pool.read_columns(last, ("step",))["step"], before.records["step"])
+        shutil.rmtree(tmp_path / "shards")
+        manifest = dataclasses.replace(manifest, shards=())
+        manifest = commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 3, episodes[:9]))
+
+
+def test_a_dataset_that_is_extended_while_it_is_opened_or_verified_is_opened_as_it_is_then(
+    drawn, tmp_path, monkeypatch
+):
+    manifest = drawn.manifest(block_size=3)
+    episodes = [drawn.episode(index, 3) for index in range(6)]
+    shorter = commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 2, episodes[:4]))
+    real, extended = Manifest.load, []
+
+    def load(folder):
+        found = real(folder)
+        if not extended:
+            extended.append(commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 2, episodes)))
+        return found
+
+    monkeypatch.setattr(Manifest, "load", load)
+    pool = open_shards([tmp_path])
+    assert pool.episodes == 6 and pool.manifest_digest == extended[0].digest() != shorter.digest()
+
+
 def test_another_discount_makes_the_returns_anew_and_leaves_all_else_as_it_is(dataset, drawn):
     pool = open_shards([dataset])
     halved = pool.with_discount(0.5)

@@ -29,7 +29,7 @@ def alive(mark):
 
 
 def end_in_the_middle(engine, number, folder):
-    """Start `driver.py`, send it a signal when two workers work, and check that nothing is left after 5 seconds."""
+    """Start `driver.py`, send it a signal when two workers work, and check that nothing is left soon after."""
     notes, temporary = folder / "notes", folder / "t"
     notes.mkdir()
     temporary.mkdir()
@@ -46,7 +46,7 @@ def end_in_the_middle(engine, number, folder):
             time.sleep(0.05)
         parent.send_signal(number)
         parent.wait()
-    until = time.monotonic() + 5
+    until = time.monotonic() + 20  # 5 on a machine of one's own
     while (alive(mark) or list(temporary.iterdir())) and time.monotonic() < until:
         time.sleep(0.05)
     assert len(opened(notes)) == 2 and not alive(mark)

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -150,10 +151,24 @@ def test_a_folder_of_something_else_is_not_touched(settings: Make, tmp_path: Pat
         train(settings())
 
 
-def test_two_trainings_do_not_share_a_folder(settings: Make) -> None:
+def test_two_trainings_do_not_share_a_folder(settings: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("graspq.common.files.LOCK_SECONDS", 0.1)
     run = train(settings(steps=2))
-    with run.locked(), pytest.raises(UserError, match="another training works here"):
+    with Run.held(run.folder, run.config, frozenset()), pytest.raises(UserError, match="another training works here"):
         train(settings(steps=2))
+
+
+def test_of_two_trainings_that_begin_in_one_folder_the_second_finds_the_settings_of_the_first(
+    settings: Make, tmp_path: Path
+) -> None:
+    folder, first, second = tmp_path / "run", {"settings": {"seed": 0}}, {"settings": {"seed": 1}}
+    with ThreadPoolExecutor(1) as executor:
+        with Run.held(folder, first, frozenset()):
+            late = executor.submit(lambda: Run.held(folder, second, frozenset()).__enter__())
+            time.sleep(0.3)
+        with pytest.raises(UserError, match="holds a run with seed = 0, not 1"):
+            late.result()
+    assert Run.open(folder).config == first
 
 
 def test_another_discount_makes_the_returns_of_mc_anew_and_says_so(
