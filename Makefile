@@ -6,6 +6,7 @@ SEED ?= 0
 TORCH_INDEX ?=
 TEST_WORKERS ?= 2
 BENCH ?=
+HOURS ?= 3
 PLAN ?= studies/plans/10k.toml
 FAULTS ?=
 
@@ -17,7 +18,7 @@ QUICK := runs/quickstart
 QUICK_STEPS := 700
 export PYTHONUNBUFFERED := 1
 
-.PHONY: help setup quickstart test faults python-versions lint types data bench study clean
+.PHONY: help setup quickstart test faults soak python-versions lint types data bench study clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 17
@@ -63,6 +64,9 @@ test: setup lint types ## everything that CI checks (at most 10 minutes)
 
 faults: setup ## break every command in every way that is listed: results/faults.json and the table in RESULTS.md [FAULTS='--kind crash'] (goes on where it was stopped)
 	$(BIN)/python -P tests/faults $(FAULTS)
+
+soak: setup ## collect, train and evaluate in a loop for HOURS=3 with random kills: results/soak.json
+	$(BIN)/python -P tests/faults --soak-hours $(HOURS)
 
 python-versions: setup ## whether newer Pythons at hand collect the same bytes (3.12, 3.13; skips those that are not there)
 	@bash .ci/python_versions.sh

@@ -23,6 +23,7 @@ from graspq.common.files import write_json, write_text  # noqa: E402
 from tests.faults.harness import GOOD, MADE, Log, Work, code_digest, rows_of, table, try_kind  # noqa: E402
 from tests.faults.kinds import KINDS  # noqa: E402
 from tests.faults.planted import PLANTED, found_by  # noqa: E402
+from tests.faults.soak import soak  # noqa: E402
 from tests.faults.system_calls import shim  # noqa: E402
 
 START, END = "<!-- made by tests/faults -->", "<!-- end of faults -->"
@@ -39,7 +40,10 @@ def main() -> int:
         "--workers", type=int, default=min(2, os.cpu_count() or 1), help="processes that share the work"
     )
     parser.add_argument("--part", type=int, help=argparse.SUPPRESS)  # of one of them
+    parser.add_argument("--soak-hours", type=float, help="instead a loop with random kills: results/soak.json")
     given = parser.parse_args()
+    if given.soak_hours is not None:
+        return soak(given.soak_hours)
     until = time.monotonic() + 60 * given.limit_minutes
     folder = ROOT / "runs" / "faults"
     part = (0, 1) if given.part is None else (given.part, given.workers)

@@ -268,8 +268,8 @@ class Work:
             preexec: called in the process before the command begins.
         """
         program, *arguments = map(str, argv)
-        script = Path(sys.executable).with_name(program)
-        words = [str(script)] if script.exists() else [sys.executable, "-P", program]
+        script = [sys.executable, "-P", program]
+        words = script if program.endswith(".py") else [str(Path(sys.executable).with_name(program))]
         start = time.monotonic()
         with subprocess.Popen(
             [*before, *words, *arguments],

@@ -7,7 +7,14 @@ from tests.faults.fuzz import Fuzz
 from tests.faults.harness import Kind
 from tests.faults.hostile import Hostile
 from tests.faults.power_loss import PowerLoss
+from tests.faults.ray_cluster import Ray
+from tests.faults.reproducible import Reproducible
 from tests.faults.shards import Shards
+from tests.faults.signals import Signals, Suspended
+from tests.faults.streams import ClosedStreams
+from tests.faults.surroundings import Clock, Paths, Surroundings
+from tests.faults.together import Together
+from tests.faults.workers import Workers
 
 KINDS: list[Kind] = [
     CrashPoints(),
@@ -23,4 +30,14 @@ KINDS: list[Kind] = [
     Shards(),
     Hostile(),
     Fuzz(),
+    Together(),
+    Workers(),
+    Signals(),
+    Suspended(),
+    Clock(),
+    ClosedStreams(),
+    Surroundings(),
+    Paths(),
+    Ray(),
+    Reproducible(),
 ]

@@ -1,0 +1,92 @@
+"""Ray: a node that is killed, a head that is killed and started again, an object store that is full."""
+
+import contextlib
+import importlib.util
+import logging
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from tests.faults.commands import Running, one_line
+from tests.faults.harness import Fault, Tried, Work
+from tests.faults.workers import COLLECT
+
+FAULTS = ("a node killed", "the head killed", "the object store full", "the command killed", "a Ray of its own")
+_STORE = 80 * 2**20
+_PATIENT = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
+
+
+class Ray:
+    """Faults of a Ray cluster on this machine; none where Ray is not installed."""
+
+    name = "Ray"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return each fault."""
+        there = importlib.util.find_spec("ray") is not None
+        for name in FAULTS if there and not short else ():
+            yield Fault(self.name, "grasp-datagen", name)
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Collect on a cluster, do it, and collect again."""
+        work.made("objects")
+        with COLLECT.case(work) as case:
+            if fault.name == "a Ray of its own":
+                ended = Running(work, [*COLLECT.words, "--engine", "ray"], case).ended()
+                broken = ended.broken()
+                return broken if broken is not None else COLLECT.fits(case, work)
+            full = fault.name == "the object store full"
+            with _cluster({"automatic_object_spilling_enabled": False} if full else {}) as cluster:
+                words = [*COLLECT.words, "--engine", "ray", "--ray-address", cluster.address]
+                with _filled(cluster.address) if full else contextlib.nullcontext():
+                    running = Running(work, words, case)
+                    running.until((case / COLLECT.result).exists)
+                    time.sleep(3.0)
+                    if fault.name == "a node killed":
+                        cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+                    elif fault.name == "the head killed":
+                        cluster.remove_node(cluster.head_node, allow_graceful=False)
+                    elif fault.name == "the command killed":
+                        running.process.kill()
+                    ended = running.ended()
+            broken = ended.broken()
+            if broken is not None:
+                return broken
+            if ended.rc not in (0, 1, -9) and not one_line(ended):
+                return Tried("lost", f"exit status {ended.rc}: {ended.line}")
+            after = COLLECT.goes_on(case, work)
+            said = ended.rc not in (0, -9)
+            return Tried("detected", ended.line) if said and after.outcome == "survived" else after
+
+
+@contextlib.contextmanager
+def _cluster(more: dict[str, Any]) -> Iterator[Any]:
+    from ray.cluster_utils import Cluster
+
+    logging.disable(logging.WARNING)
+    head = {"num_cpus": 1, "object_store_memory": _STORE, "_system_config": _PATIENT | more}
+    made = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        made.add_node(num_cpus=1, object_store_memory=_STORE)
+        yield made
+    finally:
+        made.shutdown()
+        logging.disable(logging.NOTSET)
+
+
+@contextlib.contextmanager
+def _filled(address: str) -> Iterator[None]:
+    """Hold so many objects in the store of the head that nothing more fits."""
+    import numpy as np
+    import ray
+
+    ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    held = []
+    with contextlib.suppress(ray.exceptions.RayError):
+        for size in [4 * 2**20] * 100 + [2**17] * 100:
+            held.append(ray.put(np.zeros(size, np.uint8)))
+    try:
+        yield
+    finally:
+        held.clear()
+        ray.shutdown()

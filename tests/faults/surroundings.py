@@ -1,0 +1,163 @@
+"""Where and how a command is started: locale, hash seed, paths, links, working folder, variables, a wrong clock."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+from tests.faults.commands import LINES, MAKING, STUDY, TRAIN, Line, one_line
+from tests.faults.harness import HERE, Fault, Tried, Work
+
+LOCALES = {
+    "LANG=C": {"LANG": "C", "LC_ALL": "C"},
+    "no UTF-8": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    "a locale that is not there": {"LC_ALL": "tlh_KX.ISO-8859-1", "LANG": "tlh_KX"},
+    "PYTHONHASHSEED=0": {"PYTHONHASHSEED": "0"},
+    "PYTHONHASHSEED=4711": {"PYTHONHASHSEED": "4711"},
+    "PYTHONOPTIMIZE=2": {"PYTHONOPTIMIZE": "2"},
+    "another time zone": {"TZ": "Pacific/Kiritimati"},
+    "COLUMNS=1": {"COLUMNS": "1"},
+    "no HOME": {"HOME": "/nowhere/at/all"},
+}
+FOLDERS = {
+    "spaces": "a folder with  two spaces ",
+    "a newline": "a\nfolder",
+    "two hundred letters": "f" * 200,
+    "letters of a pattern": "[a-z]*?{x}",
+    "quotes": 'it\'s "so" $HOME `x` \\ %s {0}',
+    "no text": os.fsdecode(b"\xff\xfe"),
+    "a hyphen first": "-rf",
+    "letters of other scripts": "données-数据-данные",
+}
+PLACES = ("through a link", "from another working folder", "a link as its result", "a temporary folder of 200 letters")
+CLOCKS = ("past", "future", "jumping")
+
+
+class Surroundings:
+    """Variables that a command is started with."""
+
+    name = "surroundings"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return each command with each of them."""
+        for line in () if short else LINES:
+            for name in LOCALES:
+                yield Fault(self.name, line.name, name)
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command and compare."""
+        line = _line(fault)
+        with line.case(work) as case:
+            return _run(line, case, work, LOCALES[fault.name])
+
+
+class Paths:
+    """Folders of unusual names, links, and another working folder."""
+
+    name = "paths"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return each command with each of them."""
+        for line in (TRAIN,) if short else LINES:
+            for name in ("a newline",) if short else (*FOLDERS, *PLACES):
+                # What a plan names is looked for in the working folder.
+                if (name != PLACES[2] or line in MAKING) and (name != PLACES[1] or line is not STUDY):
+                    yield Fault(self.name, line.name, name)
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command there and compare."""
+        line = _line(fault)
+        with line.case(work) as case:
+            if fault.name in FOLDERS:
+                place = case / FOLDERS[fault.name]
+                _move(case, place)
+                # Both ways: a folder that the command is in, and one that its words name.
+                there = _run(line, place, work)
+                if there.outcome not in ("survived", "detected"):
+                    return there
+                if line.result:
+                    shutil.rmtree(place / line.result) if (place / line.result).is_dir() else (
+                        place / line.result
+                    ).unlink()
+                return _run(_named(line, Path(FOLDERS[fault.name])), place, work, inside=place)
+            return _elsewhere(fault.name, line, case, work)
+
+
+def _elsewhere(name: str, line: Line, case: Path, work: Work) -> Tried:
+    if name == "through a link":
+        _move(case, case / "real")
+        (case / "link").symlink_to("real")
+        return _run(line, case / "link", work)
+    if name == "from another working folder":
+        (case / "else").mkdir()
+        return _run(_named(line, case), case / "else", work, inside=case)
+    if name == "a link as its result":
+        (case / "real").mkdir()
+        result = case / line.result
+        result.parent.mkdir(parents=True, exist_ok=True)
+        result.symlink_to(case / "real")
+        ran = work.forked(line.words, case)
+        broken = ran.broken()
+        if broken is not None:
+            return broken
+        if ran.rc != 0:
+            left = list((case / "real").iterdir())
+            return Tried("lost", f"left {left[0]}") if left else Tried("detected", ran.line)
+        return line.fits(case, work) if result.is_symlink() else Tried("lost", "the link was replaced")
+    long = case / ("t" * 200)
+    long.mkdir()
+    return _run(line, case, work, {"TMPDIR": str(long)})
+
+
+def _named(line: Line, folder: Path) -> Line:
+    """Return the command with its paths named from another working folder."""
+    inside = Path("..") / folder if not folder.is_absolute() else folder
+    paths = {"objects", "data/regular-24", "runs/mc", "runs/online", "scores", "sweep", "study", "plan.toml", "runs"}
+    paths |= {"report.html", "results", "page.md"}
+    words = [str(inside / word) if word in paths else word for word in line.words[1:]]
+    return Line((line.words[0], *words), line.needs, line.result, line.made)
+
+
+class Clock:
+    """A wall clock that is wrong, and one that jumps."""
+
+    name = "clock"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return each command with each clock; none where there is no C compiler."""
+        for line in () if short or shutil.which("cc") is None else LINES:
+            for how in CLOCKS:
+                yield Fault(self.name, line.name, how)
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Run the command with that clock and compare."""
+        shim = work.folder / "clock.so"
+        if not shim.exists():
+            subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", shim, HERE / "clock.c", "-ldl"], check=True)
+        line = _line(fault)
+        with line.case(work) as case:
+            return _run(line, case, work, {"LD_PRELOAD": str(shim), "GRASPQ_CLOCK": fault.name})
+
+
+def _line(fault: Fault) -> Line:
+    return next(line for line in LINES if line.name == fault.command)
+
+
+def _move(case: Path, place: Path) -> None:
+    found = list(case.iterdir())
+    place.mkdir()
+    for path in found:
+        path.rename(place / path.name)
+
+
+def _run(line: Line, cwd: Path, work: Work, env: dict[str, str] | None = None, inside: Path | None = None) -> Tried:
+    """Run a command and compare what it makes, in the working folder unless `inside` says where."""
+    new = env is not None
+    ran = work.run(line.words, cwd, env=env) if new else work.forked(line.words, cwd)
+    broken = ran.broken()
+    if broken is not None:
+        return broken
+    if ran.rc != 0:
+        return Tried("detected" if one_line(ran) else "lost", ran.line)
+    return line.fits(inside if inside is not None else cwd, work)

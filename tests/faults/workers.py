@@ -1,0 +1,153 @@
+"""What happens to a worker process: it is killed, killed again, stopped, or has too little memory."""
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from tests.faults.commands import EVAL, STUDY, SWEEP, Line, Running, one_line
+from tests.faults.harness import MADE, Fault, Ran, Tried, Work
+
+# Two blocks of the usual size: grasp-datagen itself, with workers.
+_COLLECT = "grasp-datagen --size 30 --objects objects --out data/regular-30 --seed 0 --workers"
+MADE["collection"] = ("data/regular-30", (f"{_COLLECT} 0",))
+COLLECT = Line((*_COLLECT.split(), "1"), ("objects",), "data/regular-30", "collection")
+
+
+def _with_workers(line: Line) -> Line:
+    words = list(line.words)
+    words[words.index("--workers") + 1] = "1"
+    return replace(line, words=tuple(words))
+
+
+LINES = {line.name: line for line in (COLLECT, *map(_with_workers, (EVAL, SWEEP, STUDY)))}
+FAULTS = (
+    "SIGKILL at once", "SIGKILL later", "SIGKILL twice", "SIGSEGV", "SIGTERM", "SIGSTOP for a while",
+    "SIGSTOP and Ctrl-C", "too little memory", "the server killed", "the command killed", "all killed",
+)  # fmt: skip
+# Failures are noted in their table, and not tried again unless asked.
+NOTING = ("grasp-sweep", "grasp-study")
+LEFT_SECONDS = 20.0
+
+
+class Workers:
+    """Faults of workers."""
+
+    name = "workers"
+
+    def faults(self, work: Work, short: bool) -> Iterable[Fault]:
+        """Return each fault of the workers of each command; the suite has tests of the engine for them."""
+        for name in () if short else LINES:
+            for fault in FAULTS:
+                yield Fault(self.name, name, fault)
+
+    def tried(self, fault: Fault, work: Work) -> Tried:
+        """Do it to the first worker that there is, see how the command ends, and run it again."""
+        line = LINES[fault.command]
+        work.made("objects")
+        with line.case(work) as case:
+            # A folder for temporary files of its own, where leftovers are seen.
+            temporary = case / "t"
+            temporary.mkdir()
+            env = {"TMPDIR": str(temporary)}
+            running = Running(work, line.words, case, env)
+            running.until(running.workers)
+            _do(fault.name, running)
+            ended = running.ended()
+            wrong = _wrong(fault.name, ended)
+            if wrong is not None:
+                return wrong
+            if not _alone(running, temporary, fault.name):
+                return Tried("lost", f"left in the folder for temporary files: {_names(temporary)}")
+            if ended.rc == 1 and line.name in NOTING:
+                line = replace(line, words=(*line.words, "--retry-failed"))
+            after = line.goes_on(case, work, env) if ended.rc != 0 else line.fits(case, work)
+            if after.outcome == "survived" and _names(temporary):
+                return Tried("lost", f"never swept: {_names(temporary)}")
+            return after if after.outcome != "survived" or ended.rc == 0 else Tried("detected", ended.line)
+
+
+def _do(what: str, running: Running) -> None:
+    def end(number: signal.Signals) -> bool:
+        for worker in running.workers()[:1]:
+            os.kill(worker, number)
+            return True
+        return False
+
+    match what:
+        case "SIGKILL at once":
+            end(signal.SIGKILL)
+        case "SIGKILL later":
+            time.sleep(2.0)
+            end(signal.SIGKILL)
+        case "SIGKILL twice":
+            seen: set[int] = set()
+            while len(seen) < 2 and running.until(lambda: set(running.workers()) - seen):
+                time.sleep(0.3)
+                for worker in set(running.workers()) - seen:
+                    seen.add(worker)
+                    _kill(worker, signal.SIGKILL)
+        case "SIGSEGV" | "SIGTERM":
+            time.sleep(1.0)
+            end(signal.Signals[what])
+        case "SIGSTOP for a while":
+            end(signal.SIGSTOP)
+            time.sleep(2.0)
+            end(signal.SIGCONT)
+        case "SIGSTOP and Ctrl-C":
+            end(signal.SIGSTOP)
+            time.sleep(0.5)
+            running.process.send_signal(signal.SIGINT)
+            time.sleep(0.5)
+            running.process.send_signal(signal.SIGINT)  # the first waits for the worker to keep what it has
+        case "too little memory":
+            for worker in running.workers()[:1]:
+                size = int(Path(f"/proc/{worker}/statm").read_text().split()[0]) * resource.getpagesize()
+                resource.prlimit(worker, resource.RLIMIT_AS, (size + 2**20, size + 2**20))
+        case "the server killed":
+            for one in running.descendants():
+                if b"forkserver" in Path(f"/proc/{one}/cmdline").read_bytes():
+                    _kill(one, signal.SIGKILL)
+                    break
+        case "the command killed":
+            time.sleep(1.0)
+            running.process.kill()
+        case "all killed":
+            time.sleep(1.0)
+            for one in running.descendants():
+                _kill(one, signal.SIGKILL)
+            running.process.kill()
+
+
+def _kill(process: int, number: signal.Signals) -> None:
+    try:
+        os.kill(process, number)
+    except ProcessLookupError:
+        return
+
+
+def _wrong(what: str, ran: Ran) -> Tried | None:
+    broken = ran.broken()
+    if broken is not None:
+        return broken
+    killed = what in ("the command killed", "all killed") and ran.rc == -signal.SIGKILL
+    if ran.rc in (0, 1, 130) or killed or one_line(ran):
+        return None
+    return Tried("lost", f"exit status {ran.rc}: {ran.line}")
+
+
+def _alone(running: Running, temporary: Path, what: str) -> bool:
+    """Return whether nothing is left of a command soon after its end; a folder of a killed one is swept later."""
+    until = time.monotonic() + LEFT_SECONDS
+    while time.monotonic() < until:
+        if not _names(temporary) or what in ("all killed", "the server killed"):
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("torch"))
