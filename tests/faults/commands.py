@@ -151,7 +151,8 @@ class Running:
         program, *arguments = map(str, words)
         script = [sys.executable, "-P", program]
         start = script if program.endswith(".py") else [str(Path(sys.executable).with_name(program))]
-        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        streams |= {"preexec_fn": _with_usual_signals}
         self._start = time.monotonic()
         self.process = subprocess.Popen(
             [*start, *arguments], cwd=cwd, env=work.environment(env), start_new_session=True, **streams | options
@@ -205,6 +206,12 @@ class Running:
             out, err = self.process.communicate()
         out, err = ((text or b"").decode(errors="replace") for text in (out, err))
         return Ran(self.process.returncode, out, err, time.monotonic() - self._start, hung)
+
+
+def _with_usual_signals() -> None:
+    """Let no signal be ignored because it was so where the harness was started, as in the background or by nohup."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def one_line(ran: Ran) -> bool:
