@@ -36,9 +36,9 @@ main()
 def started(tmp_path, *words, before="", **options):
     script = tmp_path / "grasp-tried"
     script.write_text(before + COMMAND)
-    return subprocess.Popen(
-        [sys.executable, script, *words], cwd=tmp_path, text=True, **({"stderr": subprocess.PIPE} | options)
-    )
+    # Where the suite runs in the background, its processes would ignore interrupts.
+    options = {"stderr": subprocess.PIPE, "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)} | options
+    return subprocess.Popen([sys.executable, script, *words], cwd=tmp_path, text=True, **options)
 
 
 @pytest.mark.parametrize("closed", ["1>&-", "0<&- 1>&- 2>&-"])
