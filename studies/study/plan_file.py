@@ -11,6 +11,7 @@ from graspq.common.errors import UserError
 from graspq.common.files import read_toml
 from graspq.common.options import parse_count
 from graspq.evaluate.jobs import checked_policy
+from graspq.evaluate.over_seeds import FEWEST_SCENES
 from graspq.studies.sweep.grid import MOST_TRIALS
 from graspq.studies.sweep.settings import SET_BY_SWEEP
 from graspq.studies.sweep.trial import Options
@@ -29,7 +30,7 @@ KEYS: dict[str, tuple[tuple[type, ...], Any, str]] = {
     "options": ((dict,), {}, "a table of options of training"),
     "steps": ((int, str), None, "a number of training steps, such as 3000"),
     "split": ((str,), "validation", "a split of the object set"),
-    "episodes": ((int,), 1000, "a number of grasps that each run is scored on"),
+    "episodes": ((int,), 1000, f"a number of grasps that each run is scored on, at least {FEWEST_SCENES}"),
     "policies": ((list,), ["random", "oracle"], "a list of policies to score beside the rows"),
     "reference": ((str,), None, "the name of a row"),
     "recipe": ((str,), None, "the file of a frozen recipe"),
@@ -131,6 +132,8 @@ def read_plan(path: Path) -> StudyPlan:
     for key in ("rows", "sizes"):
         if values[key] is None:
             raise UserError(f"{path}: {key} is missing; expected {KEYS[key][2]}")
+    if values["episodes"] < FEWEST_SCENES:
+        raise UserError(f"{path}: episodes = {values['episodes']}; expected {KEYS['episodes'][2]}")
     try:
         rows = tuple(row for entry in values["rows"] for row in _rows(entry, values))
         for size in values["sizes"]:

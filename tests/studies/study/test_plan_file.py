@@ -40,6 +40,7 @@ def test_a_row_with_the_papers_preset_has_the_papers_steps(tmp_path: Path) -> No
         ("rows = ['mc']", "sizes is missing"),
         ("rows = ['mc']\nsizes = ['few']", "expected a whole number"),
         ("rows = ['mc']\nsizes = ['10k']\nsteps = 0", "steps = 0"),
+        ("rows = ['mc']\nsizes = ['10k']\nepisodes = 1", "episodes = 1; expected a number of grasps"),
         ("rows = ['sarsa']\nsizes = ['10k']", "'sarsa' is unknown"),
         ("rows = [{n = 3}]\nsizes = ['10k']", "expected a list of estimators"),
         ("rows = ['mc', 'mc']\nsizes = ['10k']", "two rows are called 'mc'"),
