@@ -128,6 +128,7 @@ def remove_folder(path: Path) -> None:
     """Remove a folder so that a reader finds it whole or not at all: it first takes a temporary name."""
     leaving = path.with_name(f"{_temporary(path).name}-old")
     path.replace(leaving)
+    fsync_folder(path.parent)  # before its files go, else a power cut may leave the name with a part of them
     shutil.rmtree(leaving, ignore_errors=True)
 
 

@@ -138,9 +138,10 @@ class Run:
             raise UserError(f"{self.folder}: has no checkpoint of step {step}, only of {', '.join(map(str, known))}")
         return known[step] if step is not None else self.checkpoints()[-1]
 
-    def prune(self) -> None:
-        """Remove all but the newest checkpoints."""
-        for path in self.checkpoints()[:-KEPT_CHECKPOINTS]:
+    def prune(self, step: int) -> None:
+        """Remove all but the newest checkpoints up to a step; later ones, if any, are damaged and written again."""
+        upto = [path for path in self.checkpoints() if (step_of(path) or 0) <= step]
+        for path in upto[:-KEPT_CHECKPOINTS]:
             remove_folder(path)
 
     def forget_checkpoints_from(self, step: int) -> None:

@@ -85,7 +85,7 @@ class Session:
         if self.ranks.first:
             self.run.sync_metrics()
             save_checkpoint(self.run.checkpoints_folder, self.state)
-            self.run.prune()
+            self.run.prune(self.state.step)
         self.saved_step = self.state.step
 
     def _check_weights(self) -> None:
@@ -166,6 +166,7 @@ def session(
             state.networks.kept.update({name: tensor.to(device) for name, tensor in kept.items()})
         if ranks.first:
             run.forget_after(state.step)
+            run.prune(state.step)  # what a cut between a checkpoint and the removal of an older one has left
         yield Session(settings, estimator, run, state, held_back, ranks, state.step if newest is not None else None)
 
 

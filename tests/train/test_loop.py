@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -124,6 +125,19 @@ def test_the_configuration_names_settings_data_versions_and_precision(settings: 
 def test_only_the_newest_checkpoints_are_kept(settings: Make) -> None:
     run = train(settings(steps=10, save_every=2))
     assert [path.name for path in run.checkpoints()] == ["step-00000006", "step-00000008", "step-00000010"]
+    # A cut after the last checkpoint and before the removal of an older one.
+    shutil.copytree(run.checkpoint(6), run.checkpoints_folder / "step-00000004")
+    train(settings(steps=10, save_every=2))
+    assert [path.name for path in run.checkpoints()] == ["step-00000006", "step-00000008", "step-00000010"]
+
+
+def test_no_whole_checkpoint_is_removed_for_damaged_newer_ones(settings: Make) -> None:
+    run = train(settings(steps=10, save_every=2))
+    for path in run.checkpoints()[1:]:
+        (path / "state.json").write_text("{")
+    train(settings(steps=10, save_every=2), stop_at=7)
+    names = [path.name for path in run.checkpoints()]
+    assert names == ["step-00000006", "step-00000007", "step-00000008", "step-00000010"]
 
 
 def test_a_run_of_another_configuration_is_not_touched(
