@@ -60,6 +60,14 @@ def failure_of_machine(error: BaseException) -> MachineError | None:
     return None
 
 
+def told(error: BaseException, message: str) -> UserError:
+    """Return the error that tells a message on an exception: a `MachineError` where the machine failed.
+
+    So a sweep does not note a trial as failed for a disk that did not answer.
+    """
+    return (UserError if failure_of_machine(error) is None else MachineError)(message)
+
+
 @contextlib.contextmanager
 def naming(path: Path, instead: Path | None = None) -> Iterator[None]:
     """Let failures of the system inside say that they are of `path`: those of a write or an fsync name no file.

@@ -22,7 +22,7 @@ from typing import Any
 import click
 import filelock
 
-from graspq.common.errors import MachineError, UserError, failure_of_machine, naming
+from graspq.common.errors import MachineError, UserError, failure_of_machine, naming, told
 
 TEMPORARY_PREFIX = ".tmp-"
 _NAME_BYTES = 160  # of the 255 of a name, beside a host's 64
@@ -352,7 +352,7 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
         raise UserError(f"{path}: {missing}") from None
     # A ValueError is also text that is no UTF-8 and a number of thousands of digits.
     except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not a readable TOML file ({error})") from None
+        raise told(error, f"{path}: not a readable TOML file ({error})") from None
 
 
 def remove_temporaries(folder: Path) -> None:
@@ -386,5 +386,5 @@ def writable_folder(folder: Path, what: str) -> Path:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise UserError(f"{folder}: cannot write the {what} here ({error.strerror}); choose another folder") from None
+        raise told(error, f"{folder}: cannot write the {what} here ({error.strerror}); choose another folder") from None
     return folder

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from graspq.common.errors import UserError
+from graspq.common.errors import told
 from graspq.datasets.columns import RecordType, current_names
 from graspq.datasets.episode import Int64, UInt8
 from graspq.datasets.images import from_arrow, only
@@ -107,7 +107,7 @@ def readable(what: object) -> Iterator[None]:
         yield
     # What a file holds that no command wrote leads to whichever of these.
     except (OSError, pa.ArrowException, LookupError, ValueError, TypeError, OverflowError, MemoryError) as error:
-        raise UserError(f"{what} cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
+        raise told(error, f"{what} cannot be read ({' '.join(str(error).split())}); {REMEDY}") from None
 
 
 def read_block(

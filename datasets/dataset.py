@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, told
 from graspq.common.files import sha256_of
 from graspq.common.text import bytes_text
 from graspq.datasets.blocks import REMEDY, BlockRef, read_episode_rows, readable
@@ -85,8 +85,8 @@ class Shard:
         try:
             size, expected = path.stat().st_size, self.entry.sizes[name]
         except OSError as error:
-            raise UserError(
-                f"{path}: listed in the manifest but cannot be opened ({error.strerror}); {REMEDY}"
+            raise told(
+                error, f"{path}: listed in the manifest but cannot be opened ({error.strerror}); {REMEDY}"
             ) from None
         if size != expected:
             what = "truncated" if size < expected else "too long"

@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from graspq.common.errors import UserError
+from graspq.common.errors import MachineError, UserError, told
 from graspq.common.files import committed, remove_temporaries, sha256_of
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import Manifest, ShardEntry, episodes_file, shard_name, steps_file
@@ -136,12 +136,13 @@ def _write(path: Path, content: pa.Buffer, groups: list[pa.Table], total: int) -
 def _explained(error: OSError, path: Path, total: int) -> UserError:
     folder = path.parent.parent
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UserError(
+        return MachineError(
             f"{folder}: the disk is full; this shard needs {total:,} bytes; free some space and run the same command "
             "again, finished shards are kept"
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return UserError(f"{folder}: cannot write here ({error.strerror}); choose another folder or change its rights")
-    return UserError(
-        f"{path}: cannot be written ({error.strerror}); finished shards are kept, run the same command again"
+        message = f"{folder}: cannot write here ({error.strerror}); choose another folder or change its rights"
+        return MachineError(message)
+    return told(
+        error, f"{path}: cannot be written ({error.strerror}); finished shards are kept, run the same command again"
     )

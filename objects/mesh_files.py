@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import trimesh
 
-from graspq.common.errors import UserError
+from graspq.common.errors import told
 from graspq.objects.model import COORDINATE_DECIMALS, Color
 
 
@@ -91,5 +91,5 @@ def read_obj_parts(path: Path) -> tuple[trimesh.Trimesh, ...]:
                 raise ValueError(f"corner {used[0]}")
             parts.append(trimesh.Trimesh(points[used - 1], faces.reshape(-1, 3), process=False, validate=False))
     except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise UserError(f"{path}: not a readable mesh of an object set ({error}); make the set again") from None
+        raise told(error, f"{path}: not a readable mesh of an object set ({error}); make the set again") from None
     return tuple(parts)

@@ -15,7 +15,7 @@ from typing import Any
 
 import trimesh
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, told
 from graspq.common.files import read_json, sha256_of
 from graspq.objects.mesh_files import read_obj_parts, urdf_text
 from graspq.objects.model import Color
@@ -268,7 +268,7 @@ def _check_own(path: Path) -> None:
 
 
 def _unreadable(path: Path, error: OSError) -> UserError:
-    return UserError(f"{path}: cannot be read ({error.strerror}); make the object set again")
+    return told(error, f"{path}: cannot be read ({error.strerror}); make the object set again")
 
 
 def manifest_text(*, name: str, generator_version: str | None, seed: int | None, records: list[ObjectRecord]) -> str:

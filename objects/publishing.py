@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, told
 from graspq.common.files import committed_folder, sha256_of
 
 MANIFEST = "object_set.json"
@@ -37,8 +37,8 @@ def published(folder: Path) -> Iterator[Path]:
         with committed_folder(folder, compare=_require_same) as temporary:
             yield temporary
     except OSError as error:
-        raise UserError(
-            f"{folder}: cannot write the object set here ({error.strerror}); choose another folder"
+        raise told(
+            error, f"{folder}: cannot write the object set here ({error.strerror}); choose another folder"
         ) from None
 
 

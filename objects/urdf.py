@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, told
 from graspq.objects.geometry import Array
 from graspq.objects.model import Color
 
@@ -51,7 +51,7 @@ def read_urdf(path: Path, root: Path) -> Description:
         raise
     # A LookupError is an encoding that nobody knows.
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
-        raise UserError(f"{path}: not a readable URDF ({error}); repair or remove it") from None
+        raise told(error, f"{path}: not a readable URDF ({error}); repair or remove it") from None
 
 
 def _mesh(shape: ElementTree.Element, path: Path, root: Path) -> tuple[Path, Array]:

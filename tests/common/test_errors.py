@@ -7,9 +7,11 @@ from pathlib import Path
 import click
 import pytest
 
-from graspq.common.errors import UserError, failure_of_machine, naming, refuse_other
+from graspq.common.errors import MachineError, UserError, failure_of_machine, naming, refuse_other
 from graspq.common.files import committed
 from graspq.common.options import Command
+from graspq.datasets.blocks import readable
+from graspq.objects.mesh_files import read_obj_parts
 
 
 def test_the_setting_that_differs_is_named_with_its_place(tmp_path: Path) -> None:
@@ -40,6 +42,18 @@ def test_a_failed_write_names_the_file_that_it_was_for_and_not_its_temporary_nam
     with pytest.raises(OSError) as error, naming(path, path):
         raise OSError(errno.EIO, "", str(tmp_path / "other"))
     assert error.value.filename == str(tmp_path / "other")
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that answers EIO")
+def test_a_disk_that_does_not_answer_is_no_damaged_file(tmp_path: Path) -> None:
+    with pytest.raises(MachineError, match=r"not a readable mesh .*Input/output error"):
+        read_obj_parts(Path("/proc/self/mem"))
+    with pytest.raises(MachineError, match=r"shard: cannot be read .*Input/output error"), readable("shard:"):
+        Path("/proc/self/mem").read_bytes()
+    for missing in (lambda: read_obj_parts(tmp_path / "a.obj"), (tmp_path / "a").read_bytes):
+        with pytest.raises(UserError) as error, readable("shard"):
+            missing()
+        assert not isinstance(error.value, MachineError)
 
 
 def test_a_command_ends_in_one_line_where_the_machine_fails_and_in_a_traceback_where_it_is_wrong(
