@@ -117,7 +117,7 @@ def _content(path: Path) -> Any:
     try:
         if path.name in ("config.json", "eval.json", "plan.json"):
             return _kept(json.loads(text))
-        if path.name in ("metrics.jsonl", "sweep.jsonl", "results.jsonl", "scores.jsonl"):
+        if path.suffix == ".jsonl":
             return [_kept(json.loads(line)) for line in text.splitlines()]
         if path.suffix in (".csv", ".html", ".md"):
             return "there"

@@ -379,7 +379,8 @@ def code_digest(*files: Path) -> str:
     """Return one SHA-256 of the product's code, of the harness and of the files of a kind."""
     packages = [path.parent for path in ROOT.glob("*/__init__.py") if path.parent.name != "tests"]
     product = [path for folder in packages for path in folder.rglob("*") if path.suffix in (".py", ".html")]
-    shared = [HERE / name for name in ("harness.py", "template.py", "small_dataset.py", "system_calls.py", "shim.c")]
+    names = ("harness.py", "template.py", "small_dataset.py", "system_calls.py", "shim.c", "commands.py")
+    shared = [HERE / name for name in names]
     whole = hashlib.sha256()
     for path in sorted({*product, *shared, *files}):
         whole.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes() + b"\0")

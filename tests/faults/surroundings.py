@@ -76,10 +76,11 @@ class Paths:
                 there = _run(line, place, work)
                 if there.outcome not in ("survived", "detected"):
                     return there
-                if line.result:
-                    shutil.rmtree(place / line.result) if (place / line.result).is_dir() else (
-                        place / line.result
-                    ).unlink()
+                made = place / line.result
+                if line.result and made.is_dir():
+                    shutil.rmtree(made)
+                elif line.result:
+                    made.unlink(missing_ok=True)  # what was refused has made nothing
                 return _run(_named(line, Path(FOLDERS[fault.name])), place, work, inside=place)
             return _elsewhere(fault.name, line, case, work)
 
