@@ -82,8 +82,9 @@ def share(work: Work, workers: int) -> None:
     words = [sys.executable, "-P", str(Path(__file__).parent), *sys.argv[1:]]
     parts = [subprocess.Popen([*words, "--workers", str(workers), "--part", str(part)]) for part in range(workers)]
     try:
-        for one in parts:
-            one.wait()
+        codes = [one.wait() for one in parts]
+        if any(codes):
+            sys.exit("error: a process that tried faults has failed, so that some were not tried; run it again")
     finally:
         for one in parts:
             one.terminate()

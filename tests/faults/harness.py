@@ -446,7 +446,10 @@ def try_kind(
             continue
         if not log.knows(fault, code):
             start = time.monotonic()
-            tried = kind.tried(fault, work)
+            try:
+                tried = kind.tried(fault, work)
+            except Exception as error:  # of the harness itself, which goes on with the others
+                tried = Tried("traceback", f"of the harness: {type(error).__name__}: {error}")
             log.add(fault, code, tried, time.monotonic() - start)
             if tried.outcome not in GOOD:
                 print(f"{fault.kind}, {fault.command}, {fault.name}: {tried.outcome}: {tried.said}", file=sys.stderr)
