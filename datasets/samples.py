@@ -152,7 +152,8 @@ def gather_episodes(blocks: Blocks, owners: Sequence[int], numbers: Sequence[int
 
 def _columns(records: Records) -> dict[str, Any]:
     """Return the columns of gathered records as arguments of a batch."""
-    columns = {name: np.ascontiguousarray(records[name]) for name in batch_columns()}
+    # Copied, also of one record, which numpy calls contiguous as it is: torch refuses the steps between its fields.
+    columns = {name: records[name].copy() for name in batch_columns()}
     more = {name: column for name, column in columns.items() if name not in NAMED}
     return {name: column for name, column in columns.items() if name in NAMED} | {"more": more}
 

@@ -64,7 +64,7 @@ class ResidentPool:
                 blocks.append(dataclasses.replace(block, images=block.images[:0].copy()))
 
         def tensor(array: Any) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+            return torch.from_numpy(array.copy()).to(device)
 
         records = np.concatenate([block.records for block in blocks])
         length = np.concatenate([block.lengths for block in blocks])

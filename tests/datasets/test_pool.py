@@ -52,8 +52,8 @@ def test_episodes_can_be_iterated_and_end(new_dataset):
 
 
 def test_torch_takes_the_arrays_of_a_batch_without_a_copy(grasps):
-    for view in ("transitions", "episodes"):
-        (batch,) = first(grasps.batches(16, view=view), 1)
+    for size, view in itertools.product((1, 16), ("transitions", "episodes")):
+        (batch,) = first(grasps.batches(size, view=view), 1)
         tensors = batch.tensors()
         assert set(tensors) >= {"image", "step", "action", "reward", "terminal", "mc_return", "gripper_pose"}
         for name, array in batch.arrays().items():
