@@ -92,7 +92,7 @@ READINGS = (
 )  # fmt: skip
 
 
-SHORT = ("steps table", "manifest", "object set", "config.json", "metrics.jsonl", "weights", "eval.json", "films.npz")
+SHORT = ("steps table", "object set", "weights", "eval.json")
 
 
 class Bits:

@@ -13,9 +13,10 @@ from tests.faults.system_calls import (
     FSYNC,
     KILL,
     KILL_HALF,
+    MAKES,
     OF_COMMAND,
     RENAME,
-    SHORT,
+    TRAINS,
     WRITE,
     Scenario,
     Stage,
@@ -38,7 +39,7 @@ class CrashPoints:
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return one for every call that changes a file."""
         stage = stage_of(work)
-        for scenario in scenarios(work, short):
+        for scenario in scenarios(work, short, MAKES if self.half else TRAINS):
             count = stage.unbroken(scenario).count(WRITE if self.half else CHANGES)
             numbers = range(1, count + 1)
             for number in few(numbers, 1) if short else few(numbers, HALVES) if self.half else numbers:
@@ -67,9 +68,9 @@ class KilledByStrace:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return a few for each command."""
-        for scenario in scenarios(work, short, SHORT[:1]) if shutil.which("strace") is not None else ():
+        for scenario in scenarios(work, short) if shutil.which("strace") is not None else ():
             unbroken = stage_of(work).unbroken(scenario)
-            for name, calls in (("fsync", FSYNC), ("rename", RENAME)):
+            for name, calls in (("fsync", FSYNC), ("rename", RENAME))[: 1 if short else 2]:
                 numbers = range(1, unbroken.count(calls) + 1)
                 for number in numbers[-1:] if short else few(numbers, 3):
                     yield Fault(self.name, scenario.command, f"{name} {number}")

@@ -20,6 +20,7 @@ from tests.faults.system_calls import (
     OF_COMMAND,
     REMOVE,
     RENAME,
+    TRAINS,
     TRUNCATE,
     WRITE,
     Call,
@@ -235,9 +236,9 @@ class PowerLoss:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return some cuts for each command and way; after the last call always."""
-        for scenario in scenarios(work, short):
+        for scenario in scenarios(work, short, TRAINS):
             last = len(stage_of(work).unbroken(scenario).changes)
-            for way in WAYS:
+            for way in (LOST, MIXED) if short else WAYS:
                 numbers = [] if short else few(range(1, last + 1), MOST)
                 for number in dict.fromkeys([*numbers, last]):
                     yield Fault(self.name, scenario.command, f"after call {number}, {way}")

@@ -103,15 +103,15 @@ SCENARIOS = (
 OF_COMMAND = {scenario.command: scenario for scenario in SCENARIOS}
 
 
-SHORT = ("grasp-objects make", "grasp-train")  # what `make test` tries
+MAKES, TRAINS = "grasp-objects make", "grasp-train"  # of which `make test` tries one for each kind, or none
 
 
-def scenarios(work: Work, short: bool, commands: Sequence[str] = SHORT) -> Sequence[Scenario]:
-    """Return the scenarios that are tried: all, some for `make test`, none where system calls cannot be met."""
+def scenarios(work: Work, short: bool, command: str | None = MAKES) -> Sequence[Scenario]:
+    """Return the scenarios that are tried: all, one or none for `make test`, none where system calls cannot be met."""
     if work.shim is None:
         print(NO_COMPILER, file=sys.stderr)
         return ()
-    return [scenario for scenario in SCENARIOS if not short or scenario.command in commands]
+    return [scenario for scenario in SCENARIOS if not short or scenario.command == command]
 
 
 def shim(folder: Path) -> Path | None:

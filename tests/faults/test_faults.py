@@ -1,4 +1,4 @@
-"""The short form of `make faults`: a few faults of every kind."""
+"""The short form of `make faults`: a few faults of most kinds, in at most a minute."""
 
 from collections.abc import Iterator
 
