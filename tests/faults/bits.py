@@ -92,7 +92,7 @@ READINGS = (
 )  # fmt: skip
 
 
-SHORT = ("steps table", "object set", "weights", "eval.json")
+SHORT = ("steps table", "weights")
 
 
 class Bits:

@@ -67,12 +67,11 @@ class KilledByStrace:
     name: str = "SIGKILL at a system call (strace)"
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
-        """Return a few for each command."""
-        for scenario in scenarios(work, short) if shutil.which("strace") is not None else ():
+        """Return a few for each command; none in the short form."""
+        for scenario in scenarios(work, short, None) if shutil.which("strace") is not None else ():
             unbroken = stage_of(work).unbroken(scenario)
-            for name, calls in (("fsync", FSYNC), ("rename", RENAME))[: 1 if short else 2]:
-                numbers = range(1, unbroken.count(calls) + 1)
-                for number in numbers[-1:] if short else few(numbers, 3):
+            for name, calls in (("fsync", FSYNC), ("rename", RENAME)):
+                for number in few(range(1, unbroken.count(calls) + 1), 3):
                     yield Fault(self.name, scenario.command, f"{name} {number}")
 
     def tried(self, fault: Fault, work: Work) -> Tried:
