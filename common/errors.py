@@ -54,6 +54,8 @@ def failure_of_machine(error: BaseException) -> MachineError | None:
     if isinstance(error, OSError) and error.errno in _REMEDIES:
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
         return MachineError(f"{where}{os.strerror(error.errno)}; {_REMEDIES[error.errno]}")
+    if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+        return MachineError("not enough memory or threads; free some, or lift their limits, then run the command again")
     # PyTorch says so with a RuntimeError.
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error)):
         return MachineError("not enough memory; free some, or lift its limit, then run the same command again")

@@ -25,6 +25,8 @@ def test_failures_of_the_machine_say_what_to_do_and_defects_are_none() -> None:
     assert full is not None and full.message.startswith("data/shard: No space left on device; free some space")
     memory = failure_of_machine(MemoryError())
     assert memory is not None and "not enough memory" in memory.message
+    threads = failure_of_machine(RuntimeError("can't start new thread"))
+    assert threads is not None and "not enough memory or threads" in threads.message
     for defect in (KeyError("x"), FileNotFoundError(errno.ENOENT, "", "x"), RuntimeError("x"), OSError("x")):
         assert failure_of_machine(defect) is None
 

@@ -34,6 +34,7 @@ from tests.faults.system_calls import (
     scenarios,
 )
 
+NO_MEMORY = "not enough memory"  # of which no file is the cause
 MOST = 12  # of each kind and command, evenly spread
 IN_SHORT = ("EIO in write", "ENOSPC in open")  # the kinds that `make test` tries
 
@@ -48,7 +49,7 @@ def judged(ran: Ran, scenario: Scenario, stage: Stage, case: Path, again: Ran | 
         return Tried("survived") if differs is None else Tried("silently wrong", differs)
     if not any(
         name in ran.line
-        for name in ("new", "data/regular-24", "runs/mc", "objects/", "page.md", "plan.toml", str(case))
+        for name in ("new", "data/regular-24", "runs/mc", "objects/", "page.md", "plan.toml", str(case), NO_MEMORY)
     ):
         return Tried("silently wrong", f"names no file: {ran.line}")
     assert again is not None
