@@ -33,7 +33,7 @@ from graspq.benchmarks.stopwatch import Stopwatch
 from graspq.common.errors import UserError
 from graspq.common.options import setting
 from graspq.datasets.dataset import open_shards
-from graspq.train import augment, estimator, loop
+from graspq.train import estimator, loop, views
 from graspq.train.batch import Batch
 from graspq.train.device import Precision
 from graspq.train.estimator import targets_of
@@ -66,8 +66,8 @@ def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> Non
     shifts = torch.randint(-settings.shift, settings.shift + 1, (rows, 2), generator=seeded("benchmarks/agreement"))
     mirrored, mirror = [True, False] * (rows // 2) + [True] * (rows % 2), networks.specification.action.mirror
     assert mirror is not None
-    image = augment.shifted(batch.image, shifts, torch.tensor(mirrored))
-    action = augment.mirrored_action(batch.action, torch.tensor(mirrored), mirror).squeeze(1)
+    image = views.shifted(batch.image, shifts, torch.tensor(mirrored))
+    action = views.mirrored_action(batch.action, torch.tensor(mirrored), mirror).squeeze(1)
     theirs = plain_batch(batch)
     plain_image, plain_action = augmented(theirs["image"], theirs["action"], shifts.tolist(), mirrored, settings.shift)
     same = torch.equal(image.squeeze(1).permute(0, 3, 1, 2).float(), plain_image) and torch.equal(action, plain_action)

@@ -15,6 +15,7 @@ from graspq.common.action_space import ActionSpace
 from graspq.train.networks.network import QNetwork
 from graspq.train.search_settings import CemSettings
 from graspq.train.selection import SearchSpace, cross_entropy_method, pointed, single_steps
+from graspq.train.views import least_of_views
 
 Decision = tuple[Tensor, Tensor | None]
 """An action, float32 [1, A] in [-1, 1], and what it is worth, float32 [1], or None where the run cannot say."""
@@ -72,7 +73,8 @@ class StochasticSearch:
         """Search an action; see `ActionSelection.act`."""
         shape = (cem.iterations, 1, cem.samples, acting.action.size)
         noise = torch.from_numpy(random.standard_normal(shape, dtype=np.float32)).to(state.image.device)
-        q_of_actions, space = acting.q.at(state.image, state.step), self.space(acting, state, noise)
+        q_of_actions = least_of_views(acting.q, acting.action, state.image, state.step, cem.views)
+        space = self.space(acting, state, noise)
         found = cross_entropy_method(q_of_actions, noise, space, elites=cem.elites, answer=cem.answer)
         return self.executed(found.action.float(), cem).clamp(-1, 1), found.q.float()
 

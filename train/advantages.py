@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from graspq.common.options import setting
-from graspq.train.augment import mirror_image
 from graspq.train.batch import Batch
 from graspq.train.estimator import LaggedSettings, RegressionSettings
 from graspq.train.selection import uniform_actions
 from graspq.train.state import Networks
 from graspq.train.targets import corrected_episode_value, double_q
+from graspq.train.views import mirror_image
 
 Judge = Literal["online", "online-gradient", "lagged"]
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from graspq.train.batch import Batch
+from graspq.train.views import mirrored_action, shifted
 
 
 def augmented(batch: Batch, shift: int, mirror: Sequence[int] | None, generator: torch.Generator) -> Batch:
@@ -36,42 +37,3 @@ def augmented(batch: Batch, shift: int, mirror: Sequence[int] | None, generator:
         action=mirrored_action(batch.action, mirrored, signs),
         synthetic_action=mirrored_action(batch.synthetic_action, mirrored, signs),
     )
-
-
-def shifted(image: Tensor, shift: Tensor, mirrored: Tensor) -> Tensor:
-    """Shift images and reverse the columns of some, by index alone: no grey level is computed anew.
-
-        out[i, j] = in[clamp(i + shift₀), clamp(j' + shift₁)],  j' = W - 1 - j where mirrored, else j
-
-    Args:
-        image: uint8 [B, T, H, W, C].
-        shift: int64 [B, 2], pixels along rows and columns.
-        mirrored: bool [B].
-
-    Returns:
-        uint8 [B, T, H, W, C].
-    """
-    batch, steps, height, width, channels = image.shape
-    device = image.device
-    rows = (torch.arange(height, device=device) + shift[:, :1]).clamp(0, height - 1)
-    columns = torch.arange(width, device=device).expand(batch, -1)
-    columns = torch.where(mirrored.unsqueeze(1), columns.flip(1), columns)
-    columns = (columns + shift[:, 1:]).clamp(0, width - 1)
-    # Whole rows first, then columns: two copies that are far cheaper than one that picks pixel by pixel.
-    first_row = torch.arange(batch * steps, device=device).view(batch, steps, 1) * height
-    moved = image.reshape(-1, width * channels).index_select(0, (first_row + rows.unsqueeze(1)).flatten())
-    entries = columns.unsqueeze(2) * channels + torch.arange(channels, device=device)
-    entries = entries.view(batch, 1, width * channels).expand(-1, steps * height, -1)
-    return moved.view(batch, steps * height, width * channels).gather(2, entries).view(image.shape)
-
-
-def mirrored_action(action: Tensor, mirrored: Tensor, signs: Sequence[int]) -> Tensor:
-    """Give actions, float [B, T, A], their signs [A] in the mirror where `mirrored`, bool [B], says so."""
-    sign = torch.tensor(signs, device=action.device, dtype=action.dtype)
-    return torch.where(mirrored.view(-1, 1, 1), action * sign, action)
-
-
-def mirror_image(image: Tensor, action: Tensor, signs: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Return states and candidate actions in the mirror: uint8 [n, H, W, C] and float [n, N, A], as they were given."""
-    everything = torch.ones(len(action), dtype=torch.bool, device=action.device)
-    return image.flip(2), mirrored_action(action, everything, signs)

@@ -69,10 +69,18 @@ class Batch:
 
     @property
     def next_states(self) -> tuple[Tensor, Tensor]:
-        """Images uint8 [B T, H, W, C] and steps int64 [B T] of s'; a ValueError where the loader left them out."""
+        """Images uint8 [n, H, W, C] and steps int64 [n] of the s' that there are: none after a last step.
+
+        A ValueError where the loader left them out. What networks say of them is put in its place by `before`.
+        """
         if self.next_image is None or self.next_step is None:
             raise ValueError("no s' in this batch: a target that reads it says so by TargetValue(..., needs_next=True)")
-        return self.next_image.flatten(0, 1), self.next_step.flatten()
+        goes_on = ~self.terminal.flatten()
+        return self.next_image.flatten(0, 1)[goes_on], self.next_step.flatten()[goes_on]
+
+    def before(self, values: Tensor) -> Tensor:
+        """Return values of `next_states`, float [n] or [n, 1], at the steps before them in [B, T]; 0 at last steps."""
+        return torch.zeros_like(self.reward).masked_scatter(~self.terminal, values.to(self.reward))
 
     def real(self, values: Tensor) -> Tensor:
         """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""

@@ -21,6 +21,7 @@ class CemSettings(Settings):
     samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
     elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
     answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
+    views: int = setting(6, help="Pictures of a state of which the smallest Q counts.", minimum=1, maximum=6)
     synthetic_step: StepMode = setting(
         "scale", help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them."
     )
@@ -45,6 +46,13 @@ class CemOptions(Settings):
     cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
     cem_answer: Answer = setting(
         CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
+    )
+
+    cem_views: int = setting(
+        CemSettings.views,
+        help="Shifted and mirrored pictures of a state, of which the smallest Q counts; 1: the picture alone.",
+        minimum=1,
+        maximum=6,
     )
 
     def __post_init__(self) -> None:

@@ -2,9 +2,10 @@
 
 import torch
 
-from graspq.train.augment import augmented, mirrored_action, shifted
+from graspq.train.augment import augmented
 from graspq.train.batch import Batch
 from graspq.train.state import seeded
+from graspq.train.views import mirrored_action, shifted
 
 SIGNS = (1, -1, 1, -1)
 

@@ -73,6 +73,12 @@ def test_the_double_q_target_lets_the_network_pick_and_the_lagged_one_judge() ->
     assert (network.trunks, lagged.trunks) == (1, 1)
 
 
+def test_states_after_a_last_step_are_asked_of_no_network() -> None:
+    image, step = batch().next_states
+    assert (len(image), step.tolist()) == (1, [1])
+    assert batch().before(torch.tensor([[0.5]])).tolist() == [[0.5], [0.0]]
+
+
 def test_the_monte_carlo_target_is_the_observed_return() -> None:
     assert torch.equal(target_of("mc", Slope(1), Slope(1)), batch().mc_return)
 

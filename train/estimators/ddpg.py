@@ -43,7 +43,7 @@ def target(
     image, step = batch.next_states
     action = pointed(networks.lagged["actor"](image, step), networks.specification.action).clamp(-1, 1)
     next_value = networks.lagged_q.at(image, step)(action.unsqueeze(1))
-    return bootstrapped(batch.reward, batch.terminal, batch.in_place(next_value), settings.discount)
+    return bootstrapped(batch.reward, batch.terminal, batch.before(next_value), settings.discount)
 
 
 def actor_critic(

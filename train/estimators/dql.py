@@ -36,7 +36,7 @@ def target(batch: Batch, networks: Networks, settings: DqlSettings, random: torc
     image, step = batch.next_states
     drawn = uniform_actions(random, len(image), settings.candidates, batch.action.shape[-1]).to(image.device)
     next_value = double_q(networks.q.at(image, step)(drawn), drawn, networks.lagged_q.at(image, step))
-    return bootstrapped(batch.reward, batch.terminal, batch.in_place(next_value), settings.discount)
+    return bootstrapped(batch.reward, batch.terminal, batch.before(next_value), settings.discount)
 
 
 row = Estimator(

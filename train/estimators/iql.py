@@ -65,9 +65,8 @@ def target(batch: Batch, networks: Networks, settings: IqlSettings, random: torc
     Q; theirs is the actor (`--policy actor`).
     """
     image, step = batch.next_states
-    return bootstrapped(
-        batch.reward, batch.terminal, batch.in_place(networks.online["v"](image, step)), settings.discount
-    )
+    next_value = batch.before(networks.online["v"](image, step))
+    return bootstrapped(batch.reward, batch.terminal, next_value, settings.discount)
 
 
 def expectile_loss(error: Tensor, expectile: float) -> Tensor:

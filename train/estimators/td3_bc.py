@@ -59,7 +59,7 @@ def target(
     action = (action + noise.clamp(-settings.smoothing_bound, settings.smoothing_bound).to(action)).clamp(-1, 1)
     judged = [cast(QNetwork, networks.lagged[name]).at(image, step)(action.unsqueeze(1)) for name in CRITICS]
     next_value = torch.minimum(*judged)
-    return bootstrapped(batch.reward, batch.terminal, batch.in_place(next_value), settings.discount)
+    return bootstrapped(batch.reward, batch.terminal, batch.before(next_value), settings.discount)
 
 
 def cloning_actor_critic(

@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from graspq.common.checksums import checked_lines
 from graspq.common.files import sha256_of
 from graspq.evaluate.results_table import outcomes_of
 from graspq.studies.study.cli import main
+from graspq.studies.study.scores import read_scores
 
 
 def grasp_study(*words: str) -> int:
@@ -84,16 +86,16 @@ def test_a_study_goes_on_in_another_clone_from_what_was_published(
     plan(one, ("seeds = 2", "seeds = 1"), data=data)
     assert grasp_study(*words, "--out", "first") == 0
     published = Path("results/study-tiny.jsonl")
-    lines = [json.loads(line) for line in published.read_text().splitlines()]
+    lines = read_scores([published])
     assert [line["kind"] for line in lines] == ["scenes", "reference", "run"]
-    marked = published.read_text().replace('"trained_by"', '"marked": 1, "trained_by"')
-    published.write_text(marked)
+    lines[2]["marked"] = 1
+    published.write_text(checked_lines(lines))
 
     plan(one, data=data)
     assert grasp_study(*words, "--out", "second") == 0
     assert "1 of 2 trainings finished before, 1 of them published" in capfd.readouterr().err
     assert [path.name for path in Path("second/runs").iterdir()] == ["mc-regular-12-seed1"]
-    rows = [json.loads(line) for line in published.read_text().splitlines()][2:]
+    rows = read_scores([published])[2:]
     assert [(row["seed"], row["status"], "marked" in row) for row in rows] == [(0, "done", True), (1, "done", False)]
     assert "2 of 2 trainings" in Path("RESULTS.md").read_text()
 
@@ -102,7 +104,8 @@ def test_a_study_goes_on_in_another_clone_from_what_was_published(
     assert grasp_study(*words, "--out", "third", "--dry-run") == 0
     assert grasp_study(*words, "--out", "third") == 0
     assert "0 of 2 trainings finished before" in capfd.readouterr().err
-    published.write_text(marked.replace(lines[2]["data_sha256"], "0" * 64))
+    lines[2]["data_sha256"] = "0" * 64
+    published.write_text(checked_lines(lines))
     plan(one, data=data)
     assert grasp_study(*words, "--out", "fourth") == 2
     assert "trained on other data" in capfd.readouterr().err and not Path("fourth").exists()
