@@ -83,7 +83,13 @@ def check_agreement(current: Session, plain: PlainTraining, batch: Batch) -> Non
         precise = dataclasses.replace(networks, precision=Precision("float32", CPU))
         networks.q.eval()
         target = targets_of(settings.estimator, batch, precise, settings.own, seeded("benchmarks/candidates"), 0.0)
-        candidates = uniform_actions(seeded("benchmarks/candidates"), rows, plain.dql.candidates, action.shape[1])
+        # Ours draws for the s' that there are.
+        goes_on = ~theirs["terminal"]
+        drawn = uniform_actions(
+            seeded("benchmarks/candidates"), int(goes_on.sum()), plain.dql.candidates, action.shape[1]
+        )
+        candidates = drawn.new_zeros(rows, *drawn.shape[1:])
+        candidates[goes_on] = drawn
         asked = plain.double_q(theirs, theirs["next_image"].float(), candidates, plain.dql.discount)
         check_equal(target, {"the target of plain dql": asked})
 

@@ -223,10 +223,13 @@ def temporary_folder(what: str, path_bytes: int = 4000) -> Iterator[Path]:
                 os.close(held)  # one that sweeps was faster
     except OSError as error:
         raise UserError(f"{place}: cannot write temporary files here ({error.strerror}); set TMPDIR") from None
+    owner = os.getpid()
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        # A forked child that drops its copy of this context, as children of multiprocessing do, leaves the folder.
+        if os.getpid() == owner:
+            shutil.rmtree(folder, ignore_errors=True)
         os.close(held)
 
 

@@ -24,6 +24,7 @@ class TrainCommand(TrainingCommand):
     def groups(self, ctx: click.Context) -> list[tuple[str, list[click.Parameter]]]:
         """Return the groups of options."""
         groups = super().groups(ctx)
+        groups[0][1].sort(key=lambda one: one.name == "verify_replay")  # what is asked for least comes last
         if value_of("--verify-replay", ctx.meta.get("words", [])) is not None:
             for one in groups[0][1]:
                 one.required = False

@@ -231,3 +231,16 @@ def test_the_cache_is_where_the_user_says_and_private_where_home_is_not_to_be_wr
     private.chmod(0o777)
     with pytest.raises(UserError, match="open to others"):
         cache_folder()
+
+
+def test_a_forked_child_that_drops_its_copy_leaves_the_temporary_folder_of_its_parent():
+    kept = temporary_folder("tests")
+    folder = kept.__enter__()
+    if (child := os.fork()) == 0:
+        # As multiprocessing's children do, which forget what their parent would do at its end.
+        kept.gen.close()
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert folder.is_dir()
+    kept.__exit__(None, None, None)
+    assert not folder.exists()

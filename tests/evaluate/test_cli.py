@@ -56,7 +56,9 @@ def test_an_evaluation_holds_what_the_design_promises(
     assert tuple(summary["ci95"]) == pytest.approx(wilson_interval(summary["successes"], 2))
     assert (summary["algo"], summary["checkpoint_step"], summary["run"]) == ("mc", 4, run_folder.as_posix())
     assert summary["object_set"]["sha256"] == sha256_of(dataset / "objects" / "object_set.json")
-    assert summary["cem"] == {"iterations": 3, "samples": 64, "elites": 10, "answer": "mean", "synthetic_step": "scale"}
+    assert summary["cem"] == {
+        "iterations": 3, "samples": 64, "elites": 10, "answer": "mean", "views": 6, "synthetic_step": "scale",
+    }  # fmt: skip
     assert summary["command"].startswith("grasp-eval ") and "--episodes 2" in summary["command"]
     assert summary["versions"]["pybullet"]
     assert {film.row.episode for film in read_films(evaluation)} <= {0, 1}

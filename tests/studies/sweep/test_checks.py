@@ -24,7 +24,7 @@ def test_the_commands_understand_every_trial_of_every_estimator(preset: Any, tmp
     ("options", "said"),
     [
         ((("learning_rate", "fast"),), "'fast' is not a valid float"),
-        ((("batch_size", "1"),), "--batch-size: expected a number of at least 2, got 1"),
+        ((("batch_size", "1"),), "--batch-size: expected a number of at least 2 and at most"),
         ((("mirror", "yes"),), "--vary mirror: is a switch, expected true or false, got 'yes'"),
     ],
 )
