@@ -82,11 +82,11 @@ def naming(path: Path, instead: Path | None = None) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno is not None:
-            told = error.filename
-            if told is None:
+            named = error.filename
+            if named is None:
                 error.filename = str(path)
-            elif instead is not None and isinstance(told, str | os.PathLike):
-                inside = os.path.relpath(os.fspath(told), instead)
+            elif instead is not None and isinstance(named, str | os.PathLike):
+                inside = os.path.relpath(os.fspath(named), instead)
                 if inside != os.pardir and not inside.startswith(os.pardir + os.sep):
                     error.filename = os.path.normpath(path / inside)
         raise

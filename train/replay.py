@@ -5,12 +5,12 @@ The same machine and number of threads give the same bits; elsewhere sums are ro
 
 import dataclasses
 import math
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from graspq.common.errors import UserError
+from graspq.common.files import temporary_folder
 from graspq.datasets.dataset import open_shards
 from graspq.train.loop import train
 from graspq.train.run import Run
@@ -82,8 +82,8 @@ def replay(
             f"{' '.join(settings.shards)}: not the data of {folder} (digest {there[:16]}, expected {wanted[:16]}); "
             "name them with --shards"
         )
-    with tempfile.TemporaryDirectory(prefix="graspq-replay-") as temporary:
-        again = dataclasses.replace(settings, out=Path(temporary) / "run")
+    with temporary_folder("replay") as temporary:
+        again = dataclasses.replace(settings, out=temporary / "run")
         replayed = _rows(train(again, stop_at=REPLAYED_STEPS, show_progress=show_progress))
     return compared(recorded, replayed)
 

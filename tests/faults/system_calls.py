@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.faults.harness import HERE, TRAINING, Ran, Work, digest_of
+from tests.faults.harness import HERE, PLAN, TRAINING, Ran, Work, digest_of
 
 # As in shim.c.
 OFF, NOTE, KILL, KILL_HALF, FAIL, FAIL_ON = range(6)
@@ -49,25 +49,14 @@ class Scenario:
         return self.words.split()
 
 
-SMALL_PLAN = """rows = ["mc"]
-sizes = ["24"]
-seeds = 1
-preset = "paper"
-steps = 2
-episodes = 2
-data = "data"
-recipe = "recipe.json"
-policies = ["random"]
-threads = 1
-options = {width = 4, batch_size = 8}
-"""
+SMALL_PLAN = PLAN.replace("steps = 4", "steps = 2").replace(", save_every = 2", "")
 EVERY_STEP = TRAINING.replace("--save-every 2", "--save-every 1")
 SCENARIOS = (
     Scenario("grasp-objects make", "grasp-objects make procedural new --train 1 --test 1 --validation 1"),
     Scenario("grasp-datagen", "grasp-datagen --size 2 --objects objects --workers 0 --out new", ("objects",)),
     Scenario(
         "grasp-datagen, growing",
-        f"{HERE / 'small_dataset.py'} 12 data/regular-24 objects".replace("data/regular-24", "new"),
+        f"{HERE / 'small_dataset.py'} 12 new objects",
         ("objects",),
         (f"{HERE / 'small_dataset.py'} 3 new objects",),
     ),
