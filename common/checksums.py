@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import MachineError, UserError
+from graspq.common.errors import UserError
 from graspq.common.files import content_of, write_text
 
 ENTRY = "checksum"
@@ -83,8 +83,6 @@ def read_checked_json(path: Path, what: str, remedy: str) -> dict[str, Any]:
             raise ValueError("expected an object")
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"{path}: no {what} here") from None
-    except MachineError:
-        raise
     # Text that is no UTF-8 and numbers of thousands of digits are ValueErrors too.
     except (OSError, ValueError, RecursionError) as error:
         raise DamagedError(f"{path}: damaged, not a readable {what} ({error}); {remedy}") from None

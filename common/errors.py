@@ -1,7 +1,7 @@
 """Mistakes of a user and failures of the machine, as opposed to defects of ours.
 
-A `UserError` ends a command with one line and exit status 2, a `MachineError` with exit status 74; every other
-exception is a defect and keeps its traceback.
+Both are a `CommandError`, which ends a command with one line: a `UserError` with exit status 2, a `MachineError` with
+74. Every other exception is a defect and keeps its traceback.
 """
 
 import contextlib
@@ -14,7 +14,11 @@ from typing import Any
 import click
 
 
-class UserError(click.ClickException, ValueError):
+class CommandError(click.ClickException):
+    """What ends a command with one line and no traceback."""
+
+
+class UserError(CommandError, ValueError):
     """A mistake in what the user gave: the message names the value, what was expected and what to do.
 
     It is a `ValueError` too, so that library callers need not know click.
@@ -23,10 +27,11 @@ class UserError(click.ClickException, ValueError):
     exit_code = 2
 
 
-class MachineError(UserError):
+class MachineError(CommandError):
     """The machine failed, not the user: a disk that is full or broken, too little memory.
 
-    The same command goes on once that is mended.
+    The same command goes on once that is mended. It is no `UserError`: who passes over a file that is not what was
+    expected does not pass over one that the disk did not give.
     """
 
     exit_code = 74  # EX_IOERR of sysexits.h
@@ -62,7 +67,7 @@ def failure_of_machine(error: BaseException) -> MachineError | None:
     return None
 
 
-def told(error: BaseException, message: str) -> UserError:
+def told(error: BaseException, message: str) -> CommandError:
     """Return the error that tells a message on an exception: a `MachineError` where the machine failed.
 
     So a sweep does not note a trial as failed for a disk that did not answer.

@@ -22,7 +22,7 @@ from typing import Any
 import click
 import filelock
 
-from graspq.common.errors import MachineError, UserError, failure_of_machine, naming, told
+from graspq.common.errors import UserError, failure_of_machine, naming, told
 
 TEMPORARY_PREFIX = ".tmp-"
 _NAME_BYTES = 160  # of the 255 of a name, beside a host's 64
@@ -332,8 +332,6 @@ def read_json(path: Path, what: str) -> Any:
         return json.loads(content_of(path))
     except FileNotFoundError:
         raise UserError(f"{path}: no {what} here") from None
-    except MachineError:
-        raise
     # Text that is no UTF-8 and numbers of thousands of digits are ValueErrors too.
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a readable {what} ({error})") from None

@@ -11,7 +11,7 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from graspq.common.errors import UserError
+from graspq.common.errors import CommandError, UserError
 from graspq.common.files import LOCK_NAME, TEMPORARY_PREFIX, locked, writable_folder
 from graspq.common.machine import available_cores
 from graspq.common.provenance import versions
@@ -98,7 +98,7 @@ def _damaged(folder: Path, manifest: Manifest, plan: list[PlannedShard]) -> dict
         try:
             for path in (shard.steps, shard.episodes):
                 shard.check(path)
-        except UserError as error:
+        except CommandError as error:  # also where the disk does not give it: it is written anew
             reason = error.message.partition("; ")[0]
             if planned.get(entry.first_block, 0) < entry.episodes:
                 size = entry.first_block * manifest.block_size + entry.episodes

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from graspq.common.errors import UserError
+from graspq.common.errors import CommandError
 from graspq.common.files import LOCK_NAME, read_json, sha256_of
 from graspq.datasets.blocks import BlockRef, read_block
 from graspq.datasets.columns import record_dtype, wrong_labels
@@ -119,7 +119,7 @@ def _object_digests(folder: Path) -> dict[str, str]:
         listed = read_json(folder / OBJECT_SET, "object set")["objects"]
         records = listed.values() if isinstance(listed, dict) else listed
         return {f"objects/{name}": digest for record in records for name, digest in record["sha256"].items()}
-    except (UserError, AttributeError, KeyError, TypeError):
+    except (CommandError, AttributeError, KeyError, TypeError):
         return {}
 
 
@@ -147,13 +147,13 @@ def _faults(shard: Shard) -> Iterator[str]:
     for path in (shard.steps, shard.episodes):
         try:
             shard.check(path)
-        except UserError as error:
+        except CommandError as error:
             intact = False
             yield error.message.rsplit("; ", 1)[0] + (_where(shard) if path == shard.steps else "")
     if intact:
         try:
             yield from _content(shard)
-        except (UserError, OSError, pa.ArrowException, LookupError, ValueError, TypeError) as error:
+        except (CommandError, OSError, pa.ArrowException, LookupError, ValueError, TypeError) as error:
             yield f"{shard.steps}: not the tables expected ({error})"
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from graspq.common.errors import MachineError, UserError, told
+from graspq.common.errors import CommandError, MachineError, told
 from graspq.common.files import committed, remove_temporaries, sha256_of
 from graspq.datasets.episode import Episode
 from graspq.datasets.manifest import Manifest, ShardEntry, episodes_file, shard_name, steps_file
@@ -133,7 +133,7 @@ def _write(path: Path, content: pa.Buffer, groups: list[pa.Table], total: int) -
         raise _explained(error, path, total) from error
 
 
-def _explained(error: OSError, path: Path, total: int) -> UserError:
+def _explained(error: OSError, path: Path, total: int) -> CommandError:
     folder = path.parent.parent
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return MachineError(

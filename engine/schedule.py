@@ -4,7 +4,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Protocol, TypeVar
 
-from graspq.common.errors import UserError
+from graspq.common.errors import MachineError, UserError
 from graspq.engine.work import Died, Done, Failed, Mistake, Outcome
 
 U = TypeVar("U")
@@ -150,8 +150,8 @@ class _Schedule:
                 else:
                     self._idle.append(worker)
                 return [(unit, result)]
-            case Mistake(message):
-                raise UserError(message)
+            case Mistake(message, of_machine):
+                raise (MachineError if of_machine else UserError)(message)
             case Failed(traceback):
                 raise RuntimeError(f"{self._name(unit)} failed in a worker:\n{traceback}")
             case Died():

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from graspq.common.errors import UserError, failure_of_machine
+from graspq.common.errors import MachineError, UserError, failure_of_machine
 
 U_contra = TypeVar("U_contra", contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
@@ -49,6 +49,7 @@ class Mistake:
     """A unit raised a UserError with this message, or the machine failed it."""
 
     message: str
+    of_machine: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,8 @@ class Bench:
         except UserError as error:
             return Mistake(error.message)
         except BaseException as error:
-            failure = failure_of_machine(error)
-            return Mistake(failure.message) if failure is not None else Failed(traceback.format_exc())
+            failure = error if isinstance(error, MachineError) else failure_of_machine(error)
+            return Failed(traceback.format_exc()) if failure is None else Mistake(failure.message, of_machine=True)
 
     def close(self) -> None:
         """Leave the work."""

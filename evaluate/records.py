@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from graspq.common.checksums import DamagedError, read_checked_json, write_checked_json
-from graspq.common.errors import MachineError, UserError
+from graspq.common.errors import UserError
 from graspq.common.files import sha256_of, write_text
 from graspq.common.options import MOST
 
@@ -190,7 +190,7 @@ def find_evaluations(folder: Path) -> list[Evaluation]:
     for path in sorted(folder.rglob(EVAL_FILE)):
         try:
             found.append(Evaluation.load(path.parent))
-        except (DamagedError, MachineError):
+        except DamagedError:
             raise
         except UserError:
             continue
@@ -202,8 +202,6 @@ def finished_in(folder: Path) -> Evaluation | None:
     try:
         found = Evaluation.load(folder)
         found.rows()
-    except MachineError:
-        raise
     except DamagedError as error:
         _say_once(f"{error.message.partition('; ')[0]}: does not count as finished")
         return None

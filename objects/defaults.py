@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from graspq.common.errors import MachineError, UserError
+from graspq.common.errors import UserError
 from graspq.common.files import cache_folder
 from graspq.objects.object_set import ObjectSet
 from graspq.objects.procedural import GENERATOR_VERSION, SEED, make_procedural
@@ -36,8 +36,6 @@ def default_object_set(name: str) -> ObjectSet:
         there = ObjectSet.load(folder)
         if (there.generator_version, there.seed) == (GENERATOR_VERSION, SEED):
             return there
-    except MachineError:
-        raise
     except UserError:
         pass
     if stale and folder.is_dir() and not folder.is_symlink():

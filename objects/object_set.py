@@ -15,7 +15,7 @@ from typing import Any
 
 import trimesh
 
-from graspq.common.errors import UserError, told
+from graspq.common.errors import CommandError, UserError, told
 from graspq.common.files import read_json, sha256_of
 from graspq.objects.mesh_files import read_obj_parts, urdf_text
 from graspq.objects.model import Color
@@ -267,7 +267,7 @@ def _check_own(path: Path) -> None:
         raise _unreadable(beside, error) from None
 
 
-def _unreadable(path: Path, error: OSError) -> UserError:
+def _unreadable(path: Path, error: OSError) -> CommandError:
     return told(error, f"{path}: cannot be read ({error.strerror}); make the object set again")
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graspq.common.checksums import DamagedError
-from graspq.common.errors import MachineError, UserError
+from graspq.common.errors import UserError
 from graspq.evaluate.records import (
     EPISODES_FILE,
     EVAL_FILE,
@@ -225,7 +225,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _is_run(folder: Path) -> bool:
     try:
         Run.open(folder)
-    except (DamagedError, MachineError):
+    except DamagedError:
         raise
     except UserError:
         return False

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from graspq.common.checksums import DamagedError
-from graspq.common.errors import MachineError, UserError
+from graspq.common.errors import UserError
 from graspq.common.files import committed_folder, content_of, read_json
 from graspq.train.estimators import estimator_named
 from graspq.train.networks import build
@@ -190,8 +190,6 @@ def describe(checkpoint: Path) -> dict[str, Any]:
     path = checkpoint / STATE_FILE
     try:
         found = read_json(path, "checkpoint")
-    except MachineError:
-        raise
     except UserError as error:
         raise DamagedError(f"{error.message}; {REMEDY}") from None
     description: dict[str, Any] = found if isinstance(found, dict) else {}

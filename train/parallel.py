@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-from graspq.common.errors import UserError
+from graspq.common.errors import CommandError, MachineError, UserError
 
 Result = TypeVar("Result")
 
@@ -44,7 +44,7 @@ class Ranks:
         """Return on every rank what the function gives on the first, which alone calls it.
 
         Raises:
-            UserError: the function raised it; then it is raised on every rank.
+            UserError, MachineError: the function raised it; then it is raised on every rank.
         """
         if self.count == 1:
             return function()
@@ -52,12 +52,13 @@ class Ranks:
         if self.first:
             try:
                 outcome = [(True, function())]
-            except UserError as error:
-                outcome = [(False, error.message)]
+            except CommandError as error:
+                outcome = [(False, (isinstance(error, MachineError), error.message))]
         dist.broadcast_object_list(outcome, src=0)
         succeeded, value = outcome[0]
         if not succeeded:
-            raise UserError(value)
+            of_machine, message = value
+            raise (MachineError if of_machine else UserError)(message)
         result: Result = value
         return result
 

@@ -75,12 +75,15 @@ def least_of_views(q: QNetwork, space: ActionSpace, image: Tensor, step: Tensor,
     """
     if count == 1:
         return q.at(image, step)
-    views = VIEWS[:count]
+    # Without a mirror the second is the first once more.
+    views = list(dict.fromkeys((*view[:2], view[2] and space.mirror is not None) for view in VIEWS[:count]))
     shift = torch.tensor([view[:2] for view in views], device=image.device)
-    mirrored = torch.tensor([view[2] and space.mirror is not None for view in views], device=image.device)
-    seen = shifted(image.expand(count, -1, -1, -1).unsqueeze(1), shift, mirrored).squeeze(1)
-    q_of_views = q.at(seen, step.expand(count))
+    mirrored = torch.tensor([view[2] for view in views], device=image.device)
+    seen = shifted(image.expand(len(views), -1, -1, -1).unsqueeze(1), shift, mirrored).squeeze(1)
+    q_of_views = q.at(seen, step.expand(len(views)))
     signs = space.mirror if space.mirror is not None else (1,) * space.size
-    return lambda action: q_of_views(mirrored_action(action.expand(count, -1, -1), mirrored, signs)).amin(
-        0, keepdim=True
-    )
+
+    def least(action: Tensor) -> Tensor:
+        return q_of_views(mirrored_action(action.expand(len(views), -1, -1), mirrored, signs)).amin(0, keepdim=True)
+
+    return least

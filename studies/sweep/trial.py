@@ -210,8 +210,6 @@ def run_in(folder: Path) -> Run | None:
     """Return the training run in a folder, or None where there is none yet."""
     try:
         return Run.open(folder)
-    except MachineError:
-        raise
     except UserError:
         return None
 

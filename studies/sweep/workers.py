@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from graspq.common.checksums import write_checked_json
-from graspq.common.errors import MachineError, UserError
+from graspq.common.errors import UserError
 from graspq.common.files import cache_folder
 from graspq.datasets.dataset import open_shards
 from graspq.engine import LostUnitsError, Place, run
@@ -135,8 +135,6 @@ def _files_of(shards: tuple[str, ...]) -> tuple[Path, ...]:
 def _error(trial: Trial) -> str | None:
     try:
         trial.run()
-    except MachineError:
-        raise  # it would fail the others too
     except UserError as error:
         return error.message
     return None

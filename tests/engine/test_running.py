@@ -8,7 +8,7 @@ import pytest
 from ending import end_in_the_middle, opened
 from units_of_work import Squares
 
-from graspq.common.errors import UserError
+from graspq.common.errors import MachineError, UserError
 from graspq.engine import EngineSettings, run
 
 
@@ -67,6 +67,13 @@ def test_a_mistake_of_the_user_is_the_same_one_in_the_parent(workers):
     with pytest.raises(UserError) as raised:
         list(run(Squares(), ["mistake", ("sleep", 0.1)], local(workers)))
     assert raised.value.message == "--size: a mistake of the user's; choose another" and not children()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_failure_of_the_machine_is_one_in_the_parent_too_and_no_mistake_of_the_user(workers):
+    with pytest.raises(MachineError) as raised:
+        list(run(Squares(), ["full", ("sleep", 0.1)], local(workers)))
+    assert raised.value.message == "data: the disk is full" and not isinstance(raised.value, UserError)
 
 
 def test_a_defect_carries_its_traceback():

@@ -1,13 +1,14 @@
 """Works for the tests of the engine; a module of its own, because workers import it."""
 
 import contextlib
+import errno
 import os
 import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, told
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class Squares:
                 os._exit(7)
             case "mistake":
                 raise UserError("--size: a mistake of the user's; choose another")
+            case "full":
+                raise told(OSError(errno.ENOSPC, "full"), "data: the disk is full")
             case "defect":
                 raise ZeroDivisionError("deep in a worker")
             case ("large", size):
