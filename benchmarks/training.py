@@ -145,7 +145,8 @@ def measure(settings: TrainingSettings) -> Result:
     faster: dict[tuple[str, str], float] = {}
     # One estimator after the other: a turn of ours and one of its rival then lie within seconds of each other.
     for algo in ("mc", "dql", "ddpg"):
-        with training_of(algo, settings.shards, pool) as current:
+        # In the data's own colours: the rivals have no others.
+        with training_of(algo, settings.shards, pool, color=0.0) as current:
             batches = ready(current, pool, settings.steps)
             seconds = take_turns(rivals_of(current, batches), settings.turns)
             if algo != "ddpg":

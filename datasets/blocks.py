@@ -77,6 +77,17 @@ class BlockArrays:
         following: list[int] = (np.arange(len(self.records)) + ~self.records["terminal"]).tolist()
         return following
 
+    @functools.cached_property
+    def last_rows(self) -> list[int]:
+        """The last row of each episode."""
+        last: list[int] = (self.first_rows + self.lengths - 1).tolist()
+        return last
+
+    def row_of(self, number: int) -> int:
+        """Return the row of the item `number`: first all rows, then the last rows of episodes, again and again."""
+        beyond = number - len(self.records)
+        return number if beyond < 0 else self.last_rows[beyond % len(self.last_rows)]
+
     @property
     def bytes(self) -> int:
         """Memory that it holds."""

@@ -200,6 +200,7 @@ class ShardPool:
         prefetch: int = 2,
         every: int = 1,
         need_next: bool = True,
+        last_step_weight: int = 1,
         max_steps: int | None = None,
     ) -> Loader[Any]:
         """Return an endless iterator of batches, the same ones for the same arguments.
@@ -220,12 +221,13 @@ class ShardPool:
             prefetch: batches assembled ahead; 0 works without a thread.
             every: global steps from one batch to the next: n processes that share the work take every n-th.
             need_next: whether transitions have s′; where no target reads it, leaving it out halves the copying.
+            last_step_weight: how often an epoch takes the last step of each episode; all others once. Of transitions.
             max_steps: what episodes are padded to; the task's T if not given.
 
         Raises:
             UserError: the batch is larger than the data, the buffer too small, or (on iterating) a shard is damaged.
         """
-        counts, gather = self._view(view, need_next, max_steps)
+        counts, gather = self._view(view, need_next, max_steps, last_step_weight)
         rows = [ref.rows for ref in self.blocks]
         buffer_rows = buffer_bytes // self.row_bytes
         sampler = Sampler(rows, batch_size, seed, buffer_rows, rank, ranks, items_per_block=counts)
@@ -257,10 +259,13 @@ class ShardPool:
 
         return TorchDataset(partial(self.batches, batch_size, seed, view=view), options)
 
-    def _view(self, view: View, need_next: bool, max_steps: int | None) -> tuple[list[int], Gather[Any]]:
+    def _view(
+        self, view: View, need_next: bool, max_steps: int | None, last_step_weight: int = 1
+    ) -> tuple[list[int], Gather[Any]]:
         """Return how many items of a view each block has, and what gathers them."""
         if view == "transitions":
-            return [ref.rows for ref in self.blocks], partial(gather_transitions, need_next=need_next)
+            counts = [ref.rows + (last_step_weight - 1) * ref.episodes for ref in self.blocks]
+            return counts, partial(gather_transitions, need_next=need_next)
         if view == "episodes":
             longest = self.max_steps if max_steps is None else max_steps
             return [ref.episodes for ref in self.blocks], partial(gather_episodes, max_steps=longest)

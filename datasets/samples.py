@@ -104,16 +104,17 @@ NAMED = {field.name for field in dataclasses.fields(Samples)}
 
 
 def gather_transitions(
-    blocks: Blocks, owners: Sequence[int], rows: Sequence[int], *, need_next: bool
+    blocks: Blocks, owners: Sequence[int], numbers: Sequence[int], *, need_next: bool
 ) -> TransitionBatch:
-    """Return the batch of row `rows[i]` of block `owners[i]`, for all i."""
+    """Return the batch of item `numbers[i]` of block `owners[i]`, for all i; see `BlockArrays.row_of`."""
     shape = blocks[owners[0]].images.shape[1:]
-    image = _room((len(rows), *shape))
-    next_image = _room((len(rows), *shape)) if need_next else None
-    records = np.empty(len(rows), blocks[owners[0]].records.dtype)
+    image = _room((len(numbers), *shape))
+    next_image = _room((len(numbers), *shape)) if need_next else None
+    records = np.empty(len(numbers), blocks[owners[0]].records.dtype)
     copied = opaque(records)
-    for index, (owner, row) in enumerate(zip(owners, rows, strict=True)):
+    for index, (owner, number) in enumerate(zip(owners, numbers, strict=True)):
         block = blocks[owner]
+        row = block.row_of(number)
         image[index] = block.images[row]
         if next_image is not None:
             next_image[index] = block.images[block.next_rows[row]]

@@ -32,6 +32,7 @@ class Batch:
         next_image: uint8 [B, T, H, W, C], meaningless where terminal; None in episodes and where no target reads it.
         next_step: int64 [B, T]; None as `next_image`.
         mask: bool [B, T], false on padding; None where there is none.
+        weight: float32 [B, T], of each step in the mean loss; None where all weigh the same.
         more: the pose before the action, `gripper_pose`, and columns of one's own, [B, T, ...] as stored: augmentation
             leaves them alone.
     """
@@ -46,6 +47,7 @@ class Batch:
     next_image: Tensor | None = None
     next_step: Tensor | None = None
     mask: Tensor | None = None
+    weight: Tensor | None = None
     more: dict[str, Tensor] = dataclasses.field(default_factory=dict)
 
     @classmethod
@@ -86,6 +88,13 @@ class Batch:
         """Return the entries of [B, T, ...] that are no padding as [n, ...]: the states that a network sees."""
         flat = values.flatten(0, 1)
         return flat if self.mask is None else flat[self.mask.flatten()]
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the mean of values of the real steps, float [n], by their weights; a scalar."""
+        if self.weight is None:
+            return values.mean()
+        weight = self.real(self.weight)
+        return (weight * values).sum() / weight.sum()
 
     def in_place(self, values: Tensor) -> Tensor:
         """Return values of the real steps, float [n] or [n, 1], where these stand in [B, T]; 0 on padding."""

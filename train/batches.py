@@ -36,6 +36,7 @@ def training_batches(
         UserError: a batch is larger than the data, the buffer too small, or a shard is damaged.
     """
     pool, target_value, resident = _with_returns(pool, settings), settings.estimator.target_value, settings.resident
+    weight = settings.last_step_weight
     # Of a pool on the device the loader gives the order alone, and reads nothing.
     with pool.batches(
         batch_items(pool, settings),
@@ -47,16 +48,24 @@ def training_batches(
         ranks=ranks.count,
         prefetch=0 if resident else 2,
         need_next=target_value.needs_next,
+        last_step_weight=weight,
     ) as loader:
-        if not resident:
-            yield (to_tensors(batch, device) for batch in loader)
-            return
-        held, sampler = ResidentPool.read(pool, device), loader.sampler
-        indices = (sampler.indices(*sampler.position(step)) for step in itertools.count(start_step))
-        if target_value.view == "episodes":
-            yield (held.episodes(index) for index in indices)
+        batches: Iterator[Batch]
+        if resident:
+            held, sampler = ResidentPool.read(pool, device, weight), loader.sampler
+            indices = (sampler.indices(*sampler.position(step)) for step in itertools.count(start_step))
+            if target_value.view == "episodes":
+                batches = (held.episodes(index) for index in indices)
+            else:
+                batches = (held.transitions(index, target_value.needs_next) for index in indices)
         else:
-            yield (held.transitions(index, target_value.needs_next) for index in indices)
+            batches = (to_tensors(batch, device) for batch in loader)
+        # Whole episodes hold a last step as often as any other: there it weighs more.
+        yield (_weighted(batch, weight) for batch in batches) if target_value.view == "episodes" else batches
+
+
+def _weighted(batch: Batch, last_step_weight: int) -> Batch:
+    return dataclasses.replace(batch, weight=1.0 + (last_step_weight - 1) * batch.terminal.float())
 
 
 def batch_items(pool: ShardPool, settings: TrainSettings) -> int:

@@ -235,4 +235,4 @@ def loss_of(estimator: Estimator[S], batch: Batch, target: Tensor, networks: Net
         action = batch.real(estimator.regressed_action(batch))
         output = networks.q(batch.real(batch.image), batch.real(batch.step), action).float()
     q = networks.q.value_of(output.detach()).abs().mean()
-    return {"loss": estimator.loss(settings).of(output, target).mean(), "q": q, "target": target.abs().mean()}
+    return {"loss": batch.mean(estimator.loss(settings).of(output, target)), "q": q, "target": target.abs().mean()}

@@ -78,7 +78,7 @@ def update(current: Session, batch: Batch) -> Metrics:
     # Ranks have numbers of their own; those of one process do not depend on how many there could be.
     keys = (settings.seed, state.step, *([current.ranks.rank] if current.ranks.count > 1 else []))
     mirror = state.networks.specification.action.mirror if settings.mirror else None
-    batch = augmented(batch, settings.shift, mirror, seeded("train/augment", *keys))
+    batch = augmented(batch, settings.shift, mirror, seeded("train/augment", *keys), settings.color)
     rate = learning_rate(settings, state.step)
     for part in state.optimizers:
         state.set_rate(part, rate)

@@ -38,8 +38,22 @@ class Recipe(Settings):
         minimum=0,
         maximum=0.999999,
     )
+    last_step_weight: int = setting(
+        4,
+        help="How often an epoch takes the last step of each grasp, the one whose target is the outcome itself; all "
+        "others once. In whole episodes, how much its loss weighs.",
+        minimum=1,
+        maximum=1000,
+    )
     shift: int = setting(4, help="Largest random shift of images, pixels.", minimum=0, maximum=32)
     mirror: bool = setting(True, help="Mirror half of each batch, where the data's action space has a mirror.")
+    color: float = setting(
+        0.3,
+        help="Change colours at random: exchange channels, scale each by up to this part, shift it by up to this times "
+        "60 grey levels; 0: never.",
+        minimum=0,
+        maximum=1,
+    )
     precision: Literal["auto", "float32", "bfloat16"] = setting(
         "auto", help="Arithmetic of the networks; auto: bfloat16 on hardware that has instructions for it."
     )
@@ -74,7 +88,9 @@ PAPER = Recipe(
     schedule="constant",
     warmup=0.0,
     average_decay=0.0,
+    last_step_weight=1,
     shift=0,
     mirror=False,
+    color=0.0,
     precision="float32",
 )

@@ -31,19 +31,21 @@ class ResidentPool:
 
     Attributes:
         image: uint8 [N, H, W, C].
+        row: int64 [items], the row of each item; on the CPU. See `BlockArrays.row_of`.
         columns: the other columns of the data by name, [N, ...]; see `Batch` for their types.
         first_row: int64 [E], the first row of each episode.
         length: int64 [E], steps of each; on the CPU.
     """
 
     image: Tensor
+    row: Int64
     columns: dict[str, Tensor]
     first_row: Tensor
     length: Int64
 
     @classmethod
-    def read(cls, pool: ShardPool, device: torch.device) -> "ResidentPool":
-        """Read all blocks of a pool onto a device.
+    def read(cls, pool: ShardPool, device: torch.device, last_step_weight: int = 1) -> "ResidentPool":
+        """Read all blocks of a pool onto a device; `last_step_weight` as in `ShardPool.batches`.
 
         Raises:
             UserError: the images do not fit, or a shard is damaged.
@@ -55,11 +57,14 @@ class ResidentPool:
                 f"--resident: {image_bytes(pool) / 2**30:.1f} GiB of images do not fit on {device}; leave it out"
             ) from None
         blocks: list[BlockArrays] = []
+        rows: list[Int64] = []
         row = 0
         with ThreadPoolExecutor(READERS) as executor:
             for block in executor.map(pool.read_block, pool.blocks):
                 # A copy: what Arrow read is read-only, which torch does not know.
                 image[row : row + len(block.images)] = torch.from_numpy(block.images.copy()).to(device)
+                rows.append(row + np.arange(len(block.images)))
+                rows += [row + np.array(block.last_rows)] * (last_step_weight - 1)
                 row += len(block.images)
                 blocks.append(dataclasses.replace(block, images=block.images[:0].copy()))
 
@@ -69,11 +74,11 @@ class ResidentPool:
         records = np.concatenate([block.records for block in blocks])
         length = np.concatenate([block.lengths for block in blocks])
         columns = {name: tensor(records[name]) for name in records.dtype.names or () if name not in SOURCES}
-        return cls(image, columns, tensor(np.cumsum(length) - length), length)
+        return cls(image, np.concatenate(rows), columns, tensor(np.cumsum(length) - length), length)
 
-    def transitions(self, rows: Int64, need_next: bool) -> Batch:
-        """Return the transitions of rows, int64 [B], as `to_tensors` gives those of a `TransitionBatch`."""
-        index = torch.from_numpy(rows).to(self.image.device)
+    def transitions(self, items: Int64, need_next: bool) -> Batch:
+        """Return the transitions of items, int64 [B], as `to_tensors` gives those of a `TransitionBatch`."""
+        index = torch.from_numpy(self.row[items]).to(self.image.device)
         columns = {name: column[index].unsqueeze(1) for name, column in self.columns.items()}
         batch = Batch.of({"image": self.image[index].unsqueeze(1), **columns})
         if not need_next:

@@ -89,7 +89,9 @@ class TrainSettings(Recipe):
         Raises:
             UserError: a name is unknown or a value is out of range.
         """
-        flat = {name: value for name, value in values.items() if name not in NESTED}
+        # Runs from before there were these settings took every step once, in its own colours.
+        before = {"last_step_weight": 1, "color": 0.0}
+        flat = before | {name: value for name, value in values.items() if name not in NESTED}
         own = estimator_named(flat["algo"]).settings.from_json(values["own"])
         network_own = network_named(flat["network"]).settings.from_json(values["network_own"])
         return super().from_json(flat | {"own": own, "network_own": network_own})

@@ -1,3 +1,4 @@
+import collections
 import gc
 import itertools
 import multiprocessing
@@ -75,10 +76,21 @@ def test_an_epoch_covers_the_data_once(pool):
     assert pool.rows - len(keys) < 100
 
 
+def test_an_epoch_takes_last_steps_as_often_as_they_weigh(pool, small_buffer):
+    loader = pool.batches(1, 0, buffer_bytes=small_buffer, last_step_weight=3)
+    assert loader.sampler.windows_per_epoch > 1
+    batches = take(loader, loader.sampler.steps_per_epoch)
+    taken = collections.Counter((int(batch.episode_id[0]), int(batch.step[0])) for batch in batches)
+    ends = {(int(batch.episode_id[0]), int(batch.step[0])) for batch in batches if batch.terminal[0]}
+    assert len(taken) == pool.rows and len(ends) == pool.episodes
+    assert all(count == (3 if key in ends else 1) for key, count in taken.items())
+
+
 @pytest.mark.parametrize("start", [1, 60])
 def test_a_resumed_run_gives_the_batches_of_an_unbroken_one(pool, small_buffer, start):
-    unbroken = take(pool.batches(100, 9, buffer_bytes=small_buffer), 70)
-    resumed = take(pool.batches(100, 9, buffer_bytes=small_buffer, start_step=start), 70 - start)
+    options = {"buffer_bytes": small_buffer, "last_step_weight": 2}
+    unbroken = take(pool.batches(100, 9, **options), 70)
+    resumed = take(pool.batches(100, 9, **options, start_step=start), 70 - start)
     for one, two in zip(unbroken[start:], resumed, strict=True):
         same(one, two)
 

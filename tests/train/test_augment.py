@@ -2,7 +2,7 @@
 
 import torch
 
-from graspq.train.augment import augmented
+from graspq.train.augment import augmented, recolored
 from graspq.train.batch import Batch
 from graspq.train.state import seeded
 from graspq.train.views import mirrored_action, shifted
@@ -63,7 +63,7 @@ def test_images_and_actions_of_a_sample_are_mirrored_together_and_about_half_of_
 
 
 def test_a_state_and_its_successor_are_changed_alike() -> None:
-    result = augmented(batch_of(32), 4, SIGNS, seeded("tests/draws"))
+    result = augmented(batch_of(32), 4, SIGNS, seeded("tests/draws"), 0.3)
     assert result.next_image is not None
     assert torch.equal(result.image, result.next_image)
 
@@ -71,9 +71,29 @@ def test_a_state_and_its_successor_are_changed_alike() -> None:
 def test_all_steps_of_an_episode_are_changed_alike() -> None:
     batch = batch_of(8, steps=3)
     batch.image[:] = batch.image[:, :1].clone()
-    result = augmented(batch, 4, SIGNS, seeded("tests/draws"))
+    result = augmented(batch, 4, SIGNS, seeded("tests/draws"), 0.3)
     assert torch.equal(result.image[:, 0], result.image[:, 2])
     assert not torch.equal(result.image, batch.image)
+
+
+def test_other_colours_are_those_of_the_formula() -> None:
+    image = torch.tensor([[10, 100, 250], [0, 1, 2]], dtype=torch.uint8).view(2, 1, 1, 1, 3)
+    order = torch.tensor([[2, 0, 1], [0, 1, 2]])
+    gain, bias = torch.tensor([[1.0, 1.5, 0.7], [1.0, 1.0, 1.0]]), torch.tensor([[18.0, 0.0, -9.5], [-1.0, 0.0, 0.0]])
+    assert recolored(image, order, gain, bias).flatten().tolist() == [255, 15, 60, 0, 1, 2]
+
+
+def test_colours_change_by_as_much_as_is_asked_and_places_by_nothing() -> None:
+    batch = batch_of(300)
+    batch.image[:] = torch.tensor([50, 100, 200], dtype=torch.uint8)
+    plain, result = (augmented(batch, 4, SIGNS, seeded("tests/draws"), color) for color in (0.0, 0.3))
+    assert torch.equal(plain.action, result.action)
+    levels = result.image[:, 0, 0, 0]
+    order = levels.argsort(1)
+    assert len(torch.unique(order, dim=0)) == 6 and torch.equal(plain.image, batch.image)
+    darkest, brightest = levels.amin(1), levels.amax(1)
+    assert 17 <= int(darkest.min()) < 27 and 73 < int(darkest.max()) <= 83, "50 times 0.7 to 1.3, 18 less or more"
+    assert 122 <= int(brightest.min()) < 140 and int(brightest.max()) == 255
 
 
 def test_shifts_reach_but_do_not_exceed_the_limit() -> None:

@@ -47,10 +47,12 @@ def assert_same(first: Batch, second: Batch) -> None:
 def test_resident_batches_are_those_of_the_stream_bit_by_bit(settings: Make, algo: str, ranks: Ranks) -> None:
     discounted = {"discount": 0.7} if algo == "mc" else {}
     # Beyond the end of an epoch.
-    both = (settings(algo, resident=resident, **discounted) for resident in (False, True))
+    both = (settings(algo, resident=resident, last_step_weight=3, **discounted) for resident in (False, True))
     streamed, resident = (batches(one, 40, 5, ranks) for one in both)
     for first, second in zip(streamed, resident, strict=True):
         assert_same(first, second)
+        weight = 1.0 + 2.0 * first.terminal if algo == "corr-mc" else None
+        assert first.weight is weight is None or torch.equal(first.weight, weight)
     assert (streamed[0].next_image is not None) == (algo == "dql")
 
 
@@ -67,6 +69,22 @@ def test_images_that_fit_nowhere_are_refused_in_one_line(dataset: Path) -> None:
     first = dataclasses.replace(pool.blocks[0], rows=2**52)
     with pytest.raises(UserError, match=r"--resident: .* GiB of images do not fit on cpu; leave it out"):
         ResidentPool.read(dataclasses.replace(pool, blocks=(first, *pool.blocks[1:])), CPU)
+
+
+def test_a_mean_follows_the_weights_of_the_real_steps() -> None:
+    step = torch.zeros(2, 2, dtype=torch.int64)
+    mask, weight = torch.tensor([[True, True], [True, False]]), torch.tensor([[1.0, 3.0], [2.0, 9.0]])
+    batch = Batch(*[step.float()] * 7, mask=mask)
+    values = torch.tensor([1.0, 2.0, 4.0])
+    assert batch.mean(values) == pytest.approx(7 / 3)
+    assert dataclasses.replace(batch, weight=weight).mean(values) == pytest.approx((1 + 6 + 8) / 6)
+
+
+def test_a_run_of_before_there_was_a_setting_goes_on_without_it(settings: Make) -> None:
+    recorded = settings("mc").to_json()
+    assert recorded.pop("last_step_weight") != 1 and recorded.pop("color") != 0
+    restored = TrainSettings.from_json(recorded)
+    assert (restored.last_step_weight, restored.color) == (1, 0)
 
 
 def test_a_batch_of_episodes_has_about_as_many_transitions_or_so_many_episodes(settings: Make, dataset: Path) -> None:

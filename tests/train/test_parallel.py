@@ -18,7 +18,15 @@ from graspq.train.run import Run
 from graspq.train.settings import complete
 
 # The paper's network has no batch statistics; without augmentation a rank's random numbers decide nothing for `mc`.
-PLAIN = {"network": "paper", "shift": 0, "mirror": False, "precision": "float32", "steps": 4, "batch_size": 32}
+PLAIN = {
+    "network": "paper",
+    "shift": 0,
+    "mirror": False,
+    "color": 0,
+    "precision": "float32",
+    "steps": 4,
+    "batch_size": 32,
+}
 
 
 def torchrun(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -39,6 +47,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, two_states: SimpleNamespac
     folder = tmp_path_factory.mktemp("ranks")
     shards = str(two_states.dataset(folder / "data", 20))
     words = ["--algo", "mc", "--shards", shards, "--out", "two", "--network", "paper", "--shift", "0", "--no-mirror"]
+    words += ["--color", "0"]
     done = torchrun(*words, "--precision", "float32", "--steps", "4", "--batch-size", "32", folder=folder)
     assert done.returncode == 0, done.stderr
     given = PLAIN | {"algo": "mc", "shards": (shards,), "out": folder / "one", "threads": 1}

@@ -22,6 +22,8 @@ COMMON = {
     "average_decay": 0.0,
     "shift": 0,  # C: no augmentation
     "mirror": False,
+    "color": 0.0,
+    "last_step_weight": 1,
     "steps": 2_000_000,  # C: env_procedural
     "precision": "float32",
 }

@@ -95,7 +95,7 @@ def corrected_regression(
         output = networks.q(batch.real(batch.image), batch.real(batch.step), batch.real(batch.action)).float()
     q = networks.q.value_of(output)
     wanted = batch.real(_target(batch, values._replace(q=batch.in_place(q)), settings, progress))
-    loss = estimator.loss(settings).of(output, wanted).mean()
+    loss = batch.mean(estimator.loss(settings).of(output, wanted))
     state.descend("q", loss)
     return {"loss": loss.detach(), "q": q.detach().abs().mean(), "target": wanted.detach().abs().mean()}
 

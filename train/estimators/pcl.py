@@ -226,7 +226,7 @@ def _divide_gradients(network: nn.Module, divisor: Tensor | float) -> None:
 
 
 def _mean_square(batch: Batch, value: Tensor, target: Tensor) -> Tensor:
-    return 0.5 * batch.real(value - target).square().mean()
+    return 0.5 * batch.mean(batch.real(value - target).square())
 
 
 row = Estimator(
