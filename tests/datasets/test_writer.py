@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspq.common.errors import UserError
+from graspq.common.errors import MachineError, UserError
 from graspq.common.files import sha256_of
 from graspq.datasets.dataset import Shard, open_shards
 from graspq.datasets.images import decoded
@@ -97,7 +97,7 @@ def test_a_full_disk_gives_one_line_with_folder_and_bytes_and_leaves_nothing(dra
     (tmp_path / f"shards/.tmp-{socket.gethostname()}-{os.getpid()}-blocks-000000-000001.parquet").symlink_to(
         "/dev/full"
     )
-    with pytest.raises(UserError, match=r"disk is full; this shard needs [\d,]{4,} bytes") as caught:
+    with pytest.raises(MachineError, match=r"disk is full; this shard needs [\d,]{4,} bytes") as caught:
         write_shard(tmp_path, drawn.manifest(), 0, 2, drawn.episodes(0, 2))
     assert str(tmp_path) in caught.value.message
     assert files_of(tmp_path) == {}
