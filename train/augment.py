@@ -66,7 +66,7 @@ def recolored(image: Tensor, order: Tensor, gain: Tensor, bias: Tensor) -> Tenso
     Returns:
         uint8 [B, T, H, W, 3].
     """
-    pixels = image.view(len(image), -1, 3)
+    pixels = image.reshape(len(image), -1, 3)
     levels = pixels.gather(2, order.unsqueeze(1).expand_as(pixels)).float()
     levels = levels.mul_(gain.unsqueeze(1)).add_(bias.unsqueeze(1)).clamp_(0, 255)
     return levels.to(torch.uint8).view(image.shape)

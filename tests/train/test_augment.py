@@ -81,6 +81,9 @@ def test_other_colours_are_those_of_the_formula() -> None:
     order = torch.tensor([[2, 0, 1], [0, 1, 2]])
     gain, bias = torch.tensor([[1.0, 1.5, 0.7], [1.0, 1.0, 1.0]]), torch.tensor([[18.0, 0.0, -9.5], [-1.0, 0.0, 0.0]])
     assert recolored(image, order, gain, bias).flatten().tolist() == [255, 15, 60, 0, 1, 2]
+    # Episodes that are cut to the longest of a batch.
+    cut = image.expand(2, 5, 1, 2, 3).clone()[:, :3]
+    assert torch.equal(recolored(cut, order, gain, bias)[:, 2, 0, 1], recolored(image, order, gain, bias)[:, 0, 0, 0])
 
 
 def test_colours_change_by_as_much_as_is_asked_and_places_by_nothing() -> None:
