@@ -161,8 +161,8 @@ def row_table(rows: Rows, table: Table, reference: str | None = None) -> str:
     ]
     begun = {row for here in asked_rows(table).values() for row in here}
     unbegun = sorted({one["row"] for one in table if one["kind"] == "run"} - begun)
-    missing += [f"`{name}`: not run" for name in unbegun]
-    return text + ("\nNot whole: " + ". ".join(missing) + ".\n" if missing else "")
+    text += "\nNot whole: " + ". ".join(missing) + ".\n" if missing else ""
+    return text + ("\nNot run: " + ", ".join(f"`{name}`" for name in unbegun) + ".\n" if unbegun else "")
 
 
 def _row(place: Place, row: Scored, compared: Compared | None) -> list[str]:

@@ -42,7 +42,7 @@ def test_a_row_says_itself_how_many_of_its_trainings_failed(tmp_path: Path) -> N
     table = study(dql=0.9, ddpg=0.5) + runs("ddpg", 0.5, seeds=1, seed=3, status="failed", reason="diverged")
     publish("s", PLAN, table + runs("pcl", 0.5, status="to do"), [], tmp_path, tmp_path / "RESULTS.md")
     text = (tmp_path / "RESULTS.md").read_text()
-    assert "| `ddpg` (1 of 4 trainings failed) |" in text and "| `dql` |" in text and "`pcl`: not run" in text
+    assert "| `ddpg` (1 of 4 trainings failed) |" in text and "| `dql` |" in text and "Not run: `pcl`." in text
 
 
 def test_measures_that_choose_without_a_simulator_are_ranked_by_their_sign_within_a_place_and_an_estimator() -> None:
