@@ -56,6 +56,8 @@ _REMEDIES = {
 
 def failure_of_machine(error: BaseException) -> MachineError | None:
     """Return an exception as a failure of the machine, which says what to do; None where it is none of that."""
+    if isinstance(error, MachineError):
+        return error
     if isinstance(error, OSError) and error.errno in _REMEDIES:
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
         return MachineError(f"{where}{os.strerror(error.errno)}; {_REMEDIES[error.errno]}")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from graspq.common.checksums import read_checked_json
-from graspq.common.errors import MachineError, UserError, failure_of_machine, refuse_other
+from graspq.common.errors import UserError, failure_of_machine, refuse_other
 
 PLAN_FILE = "plan.json"
 
@@ -104,8 +104,6 @@ def carry_out(
 def _attempt(unit: Unit, keep_going: bool) -> str | None:
     try:
         unit.run()
-    except MachineError:
-        raise
     except UserError as error:
         if not keep_going:
             raise

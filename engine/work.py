@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from graspq.common.errors import MachineError, UserError, failure_of_machine
+from graspq.common.errors import UserError, failure_of_machine
 
 U_contra = TypeVar("U_contra", contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
@@ -98,7 +98,7 @@ class Bench:
         except UserError as error:
             return Mistake(error.message)
         except BaseException as error:
-            failure = error if isinstance(error, MachineError) else failure_of_machine(error)
+            failure = failure_of_machine(error)
             return Failed(traceback.format_exc()) if failure is None else Mistake(failure.message, of_machine=True)
 
     def close(self) -> None:

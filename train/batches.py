@@ -60,8 +60,10 @@ def training_batches(
                 batches = (held.transitions(index, target_value.needs_next) for index in indices)
         else:
             batches = (to_tensors(batch, device) for batch in loader)
-        # Whole episodes hold a last step as often as any other: there it weighs more.
-        yield (_weighted(batch, weight) for batch in batches) if target_value.view == "episodes" else batches
+        # Whole episodes hold a last step as often as any other: there it weighs more. With weight 1 the mean is
+        # the plain one, to the last bit.
+        weighs = target_value.view == "episodes" and weight > 1
+        yield (_weighted(batch, weight) for batch in batches) if weighs else batches
 
 
 def _weighted(batch: Batch, last_step_weight: int) -> Batch:

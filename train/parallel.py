@@ -51,14 +51,13 @@ class Ranks:
         outcome: list[Any] = [None]
         if self.first:
             try:
-                outcome = [(True, function())]
+                outcome = [(None, function())]
             except CommandError as error:
-                outcome = [(False, (isinstance(error, MachineError), error.message))]
+                outcome = [(MachineError if isinstance(error, MachineError) else UserError, error.message)]
         dist.broadcast_object_list(outcome, src=0)
-        succeeded, value = outcome[0]
-        if not succeeded:
-            of_machine, message = value
-            raise (MachineError if of_machine else UserError)(message)
+        raised, value = outcome[0]
+        if raised is not None:
+            raise raised(value)
         result: Result = value
         return result
 

@@ -27,6 +27,7 @@ def test_failures_of_the_machine_say_what_to_do_and_defects_are_none() -> None:
     assert memory is not None and "not enough memory" in memory.message
     threads = failure_of_machine(RuntimeError("can't start new thread"))
     assert threads is not None and "not enough memory or threads" in threads.message
+    assert failure_of_machine(threads) is threads
     for defect in (KeyError("x"), FileNotFoundError(errno.ENOENT, "", "x"), RuntimeError("x"), OSError("x")):
         assert failure_of_machine(defect) is None
 

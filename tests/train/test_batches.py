@@ -80,6 +80,11 @@ def test_a_mean_follows_the_weights_of_the_real_steps() -> None:
     assert dataclasses.replace(batch, weight=weight).mean(values) == pytest.approx((1 + 6 + 8) / 6)
 
 
+def test_episodes_whose_last_steps_weigh_once_have_the_plain_mean(settings: Make) -> None:
+    (batch,) = batches(settings("corr-mc", last_step_weight=1), 1)
+    assert batch.weight is None
+
+
 def test_a_run_of_before_there_was_a_setting_goes_on_without_it(settings: Make) -> None:
     recorded = settings("mc").to_json()
     assert recorded.pop("last_step_weight") != 1 and recorded.pop("color") != 0
