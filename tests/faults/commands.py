@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ _VARYING = {
 # What the words of a command say, not what comes of them.
 _SAID = {"shards", "out", "run", "command", "objects", "start_run", "workers", "threads", "engine", "folder"}
 _LEFT_OUT = (".lock", "tensorboard", "logs")
+_CHECKPOINT = re.compile(r"(.*\bcheckpoints)/step-(\d+)/")
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Line:
         """Compare what it has made with an unbroken run's.
 
         A training that was interrupted wrote what it had measured since its last row: rows have other bounds then, and
-        those of validations alone are compared.
+        those of validations alone are compared. It wrote a checkpoint, too, that an unbroken run has not, and that one
+        pushed out an older one: those of the steps that both have are compared, the last one among them.
         """
         if not self.made:
             return Tried("survived")
@@ -77,6 +79,8 @@ class Line:
             for name in one:
                 if name.endswith("metrics.jsonl") and isinstance(one[name], list):
                     one[name] = [row for row in one[name] if "validation" in row]
+        if interrupted:
+            found, expected = with_checkpoints_of(found, expected), with_checkpoints_of(expected, found)
         differs = difference(found, expected)
         return Tried("survived") if differs is None else Tried("silently wrong", differs)
 
@@ -119,6 +123,31 @@ def essence(place: Path) -> dict[str, Any]:
         if path.is_file() and not any(part in _LEFT_OUT for part in inside):
             found["/".join(inside)] = _content(path)
     return found
+
+
+def with_checkpoints_of(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Return an essence without the checkpoints that the other lacks: each run's last stays, and their number."""
+    ours, theirs = _checkpoints(one), _checkpoints(other)
+    kept = {name: value for name, value in one.items() if _CHECKPOINT.match(name) is None}
+    for run, steps in ours.items():
+        shared = steps & theirs.get(run, set()) | {max(steps)}
+        kept |= {name: value for name, value in one.items() if _place(name) in {(run, step) for step in shared}}
+        kept[run] = len(steps)
+    return kept
+
+
+def _checkpoints(found: Iterable[str]) -> dict[str, set[int]]:
+    """Return the steps of each run's checkpoints."""
+    steps: dict[str, set[int]] = {}
+    for run, step in filter(None, map(_place, found)):
+        steps.setdefault(run, set()).add(step)
+    return steps
+
+
+def _place(name: str) -> tuple[str, int] | None:
+    """Return the folder of checkpoints and the step of one of their files."""
+    match = _CHECKPOINT.match(name)
+    return (match[1], int(match[2])) if match is not None else None
 
 
 def _content(path: Path) -> Any:

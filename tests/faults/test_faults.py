@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.faults.commands import difference, with_checkpoints_of
 from tests.faults.harness import GOOD, Kind, Work
 from tests.faults.kinds import KINDS
 from tests.faults.planted import PLANTED, source_with
@@ -27,3 +28,33 @@ def test_nothing_is_lost_or_silently_wrong(kind: Kind, work: Work) -> None:
 @pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: planted.name)
 def test_the_place_of_every_planted_defect_is_still_there(planted: object, tmp_path: object) -> None:
     source_with(planted, tmp_path)  # type: ignore[arg-type]
+
+
+def _run(*steps: int, weights: str = "w") -> dict[str, str]:
+    return {f"runs/mc/checkpoints/step-{step:08d}/{name}": weights for step in steps for name in ("q", "kept")}
+
+
+def _without(end: str, run: dict[str, str]) -> dict[str, str]:
+    return {name: weights for name, weights in run.items() if not name.endswith(end)}
+
+
+@pytest.mark.parametrize(
+    ("interrupted", "differs"),
+    [
+        # An unbroken run keeps 4, 6, 8 of its 2, 4, 6, 8.
+        (_run(4, 6, 8), None),
+        (_run(5, 6, 8), None),
+        (_run(6, 7, 8), None),
+        (_run(5, 6, 7), "step-00000007/kept is there and should not be"),
+        (_run(2, 4, 6), "step-00000008/kept is missing"),
+        (_run(5, 6) | _run(8, weights="others"), "step-00000008/kept is another"),
+        (_without("6/kept", _run(5, 6, 8)), "step-00000006/kept is missing"),
+        (_run(6, 8), "runs/mc/checkpoints is another"),
+    ],
+)
+def test_checkpoints_of_an_interrupted_run_are_compared_where_an_unbroken_run_has_them(
+    interrupted: dict[str, str], differs: str | None
+) -> None:
+    unbroken = _run(4, 6, 8)
+    found = difference(with_checkpoints_of(interrupted, unbroken), with_checkpoints_of(unbroken, interrupted))
+    assert found is None if differs is None else differs in (found or "")
