@@ -20,6 +20,7 @@ import click
 import graspq
 from graspq.common.errors import UserError, failure_of_machine
 from graspq.common.streams import (
+    ended_in_order,
     give_up_streams,
     interrupts_without_traceback,
     next_interrupt_ends_at_once,
@@ -338,7 +339,8 @@ class _OneLineErrors:
         whole_streams()
         try:
             require_names_of_text(sys.argv[1:] if args is None else args)
-            result = super().main(args=args, prog_name=prog_name, standalone_mode=False, **extra)  # type: ignore[misc]
+            with ended_in_order():
+                result = super().main(args=args, prog_name=prog_name, standalone_mode=False, **extra)  # type: ignore[misc]
         except click.exceptions.Abort:
             next_interrupt_ends_at_once()
             click.echo("interrupted", err=True)

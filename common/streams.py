@@ -6,7 +6,7 @@ import select
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -79,6 +79,21 @@ def next_interrupt_ends_at_once() -> None:
     """Let another Ctrl-C end this process without a word: it is ending, and nobody would catch it."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is _USUAL:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Let SIGTERM, as schedulers and containers send it, end what runs here as a Ctrl-C does: it raises
+    KeyboardInterrupt, so that workers are ended and folders removed; without effect where somebody handles it.
+    """
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if ours:
+        signal.signal(signal.SIGTERM, _USUAL)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def interrupts_without_traceback() -> None:

@@ -97,9 +97,10 @@ class LocalWorker:
 
     def outcome(self, future: "Future[Outcome[Any]]") -> Outcome[Any]:
         """Return what came of a unit; the worker is gone where it died."""
-        try:
+        error = future.exception()
+        if error is None:
             return future.result()
-        except BrokenProcessPool:
+        if isinstance(error, BrokenProcessPool):
             self.end()
             codes = {process.exitcode for process in self._processes} - {None}
             if _SERVER_GONE in codes:
@@ -107,8 +108,10 @@ class LocalWorker:
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(number, signal.SIGKILL)  # it may live on, and hold what another will be given
             return Died(_how(next(iter(codes), None)))
-        except BaseException as error:  # such as a unit that cannot be pickled
-            return Failed(f"{type(error).__name__}: {error}")
+        if isinstance(error, KeyboardInterrupt):  # its unit heard a SIGTERM
+            self.end()
+            return Died("asked to end by SIGTERM")
+        return Failed(f"{type(error).__name__}: {error}")  # such as a unit that cannot be pickled
 
     def end(self) -> None:
         """End an idle process, or wait for the end of one that was asked; one that was stopped (SIGSTOP) is killed."""

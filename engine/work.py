@@ -90,13 +90,19 @@ class Bench:
         self._do: Callable[[Any], Any] | None = None
 
     def do(self, unit: Any) -> Outcome[Any]:
-        """Return what comes of a unit; never raises, so that no exception needs to be picklable."""
+        """Return what comes of a unit, its exceptions too, so that none of them needs to be picklable.
+
+        Raises:
+            KeyboardInterrupt: a signal asked this process to end.
+        """
         try:
             if self._do is None:
                 self._do = self._stack.enter_context(self._fetch_work().open(self._place))
             return Done(self._do(unit))
         except UserError as error:
             return Mistake(error.message)
+        except KeyboardInterrupt:
+            raise
         except BaseException as error:
             failure = failure_of_machine(error)
             return Failed(traceback.format_exc()) if failure is None else Mistake(failure.message, of_machine=True)

@@ -87,10 +87,10 @@ def run(settings: RunSettings) -> int:
     from graspq.studies.study.study import run_study
 
     plan, cells = _plan(settings, settings.workers, settings.device)
-    if settings.dry_run:
-        click.echo(plan_text(settings.folder, cells))
-        return 0
     published = _published(settings, plan, cells)
+    if settings.dry_run:
+        click.echo(plan_text(settings.folder, cells, published))
+        return 0
     status = run_study(plan, settings.folder, cells, retry_failed=settings.retry_failed, published=published)
     if status != INTERRUPTED and any(cell.name in published or cell.state().status == "done" for cell in cells):
         _publish(settings)
@@ -157,19 +157,21 @@ def _plan(settings: PlanSettings, workers: int | None = None, device: str = "aut
     return plan, cells_of(plan, settings.folder, workers=workers, device=device)
 
 
-def plan_text(folder: Path, cells: "Sequence[Cell]") -> str:
-    """Return a plan for the terminal: its trainings in order, how far each is, and the first one's commands."""
-    statuses = {cell.name: cell.state().status for cell in cells}
+def plan_text(folder: Path, cells: "Sequence[Cell]", published: "Published") -> str:
+    """Return a plan for the terminal: its trainings in order, how far each is, and the commands of the first to do."""
+    statuses = {cell.name: "published" if cell.name in published else cell.state().status for cell in cells}
+    first = next((cell for cell in cells if statuses[cell.name] == "to do"), cells[0])
     width = max(map(len, statuses))
     lines = [f"{cell.digest[:12]}  {cell.name.ljust(width)}  {statuses[cell.name]}" for cell in cells]
     steps = sum(cell.settings.steps or 0 for cell in cells)
     lines += [
         "",
-        "The first one's commands:",
-        f"  {cells[0].training_command()}",
-        f"  {cells[0].evaluation_command()}",
+        f"The commands of {first.name}:",
+        f"  {first.training_command()}",
+        f"  {first.evaluation_command()}",
         "",
     ]
-    done = list(statuses.values()).count("done")
-    lines.append(f"{len(cells)} trainings, {done} done, {steps:,} steps in all, in {folder}")
+    done = sum(one in ("done", "published") for one in statuses.values())
+    elsewhere = f", {len(published)} of them published" if published else ""
+    lines.append(f"{len(cells)} trainings, {done} done{elsewhere}, {steps:,} steps in all, in {folder}")
     return "\n".join(lines)

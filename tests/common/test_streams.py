@@ -8,6 +8,8 @@ import time
 
 import pytest
 
+from graspq.common.streams import ended_in_order
+
 # A command that prints what it is told, says how its descriptors are, opens a file and waits.
 COMMAND = """
 import os, sys, time
@@ -94,6 +96,33 @@ def test_an_interrupt_while_a_script_is_importing_is_one_word(tmp_path):
         assert process.stdout.readline() == "on\n"
         process.send_signal(signal.SIGINT)
         assert process.communicate()[1] == "interrupted\n" and process.returncode == -signal.SIGINT
+
+
+@pytest.mark.parametrize("ignored", ["", "signal.signal(signal.SIGINT, signal.SIG_IGN)"])
+def test_sigterm_ends_a_command_as_an_interrupt_does_in_the_background_too(tmp_path, ignored):
+    with started(tmp_path, "wait", before=f"import signal\n{ignored}\n", stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == "wait\n"
+        process.send_signal(signal.SIGTERM)
+        said = process.communicate()[1]
+    assert process.returncode == 130 and said.endswith("interrupted\n") and "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("before", "meanwhile"),
+    [
+        (signal.SIG_DFL, signal.default_int_handler),
+        (signal.SIG_IGN, signal.SIG_IGN),
+        (signal.getsignal, signal.getsignal),  # somebody's own
+    ],
+)
+def test_only_the_usual_answer_to_sigterm_is_replaced_and_comes_back(before, meanwhile):
+    ours = signal.signal(signal.SIGTERM, before)
+    try:
+        with ended_in_order():
+            assert signal.getsignal(signal.SIGTERM) == meanwhile
+        assert signal.getsignal(signal.SIGTERM) == before
+    finally:
+        signal.signal(signal.SIGTERM, ours)
 
 
 def test_a_second_interrupt_at_the_end_leaves_no_traceback(tmp_path):

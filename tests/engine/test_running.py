@@ -44,8 +44,9 @@ def test_workers_are_renewed_after_some_units(tmp_path):
     assert len(opened(tmp_path)) == 3
 
 
-def test_a_unit_whose_worker_is_killed_is_done_by_another(tmp_path):
-    units = [1, ("die once", str(tmp_path / "mark")), 2, 3]
+@pytest.mark.parametrize("how", ["die once", "interrupted once"])
+def test_a_unit_whose_worker_is_killed_or_asked_to_end_is_done_by_another(how, tmp_path):
+    units = [1, (how, str(tmp_path / "mark")), 2, 3]
     assert sorted(result for _, result in run(Squares(), units, local(2))) == [0, 1, 4, 9]
 
 

@@ -44,6 +44,11 @@ class Squares:
                     Path(mark).touch()
                     os.kill(os.getpid(), signal.SIGKILL)
                 return 0
+            case ("interrupted once", mark):
+                if not Path(mark).exists():
+                    Path(mark).touch()
+                    raise KeyboardInterrupt  # as a unit that handles SIGTERM does
+                return 0
             case "die":
                 os.kill(os.getpid(), signal.SIGKILL)
             case "exit":

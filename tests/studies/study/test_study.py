@@ -1,6 +1,7 @@
 """A real study from the command: killed, gone on with, done once; what has other settings is refused."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -92,6 +93,12 @@ def test_a_study_goes_on_in_another_clone_from_what_was_published(
     published.write_text(checked_lines(lines))
 
     plan(one, data=data)
+    capfd.readouterr()
+    assert grasp_study(*words, "--out", "second", "--dry-run") == 0
+    planned = capfd.readouterr().out
+    assert re.findall(r"-seed(\d) +(published|to do)\n", planned) == [("0", "published"), ("1", "to do")]
+    assert "The commands of mc-regular-12-seed1" in planned and "--seed 1" in planned
+    assert "2 trainings, 1 done, 1 of them published" in planned and not Path("second").exists()
     assert grasp_study(*words, "--out", "second") == 0
     assert "1 of 2 trainings finished before, 1 of them published" in capfd.readouterr().err
     assert [path.name for path in Path("second/runs").iterdir()] == ["mc-regular-12-seed1"]
@@ -101,7 +108,6 @@ def test_a_study_goes_on_in_another_clone_from_what_was_published(
 
     # Another recipe is not the published one; other data of the same name are refused before anything is done.
     plan(one, ("batch_size = 8", "batch_size = 4"), data=data)
-    assert grasp_study(*words, "--out", "third", "--dry-run") == 0
     assert grasp_study(*words, "--out", "third") == 0
     assert "0 of 2 trainings finished before" in capfd.readouterr().err
     lines[2]["data_sha256"] = "0" * 64
