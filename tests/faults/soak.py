@@ -3,7 +3,8 @@
     make soak HOURS=3
 
 Every cycle ends in the same bytes as the first, which was left alone; nothing stays behind; and one process that does
-the same work again and again keeps its memory and its file handles. Ends in results/soak.json.
+the same work again and again keeps its memory and its file handles. Ends in results/soak.json, which stands after each
+cycle.
 """
 
 import contextlib
@@ -18,31 +19,70 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from graspq.common.files import write_json
 from tests.faults.commands import TRAINING, Running, difference, essence
-from tests.faults.harness import HERE, ROOT, Work
+from tests.faults.harness import HERE, ROOT, Work, code_digest
 
 LINES = (
     ("grasp-datagen --size 60 --seed 5 --objects objects --out data --workers 1", "data"),
     (f"grasp-train --algo mc --shards data --out run --steps 40 --seed 5 {TRAINING}", "run"),
     ("grasp-eval run --episodes 6 --films 1 --workers 1 --device cpu --out scores", "scores"),
 )
+RESULT = ROOT / "results" / "soak.json"
 LIMIT_SECONDS = 600.0
 GROWTH = 1.1  # of the memory of the one process, from the second quarter of its cycles to the last
 
 
 def soak(hours: float, seed: int = 0) -> int:
-    """Go on for so many hours; return 1 where anything was lost or grew.
+    """Go on until so many hours are done; return 1 where anything was lost or grew.
+
+    It may be done in several sittings: one that was stopped keeps the cycles that it has finished, and the same call
+    does the hours that are left, with the same code.
 
     Args:
-        hours: at least two cycles are done.
-        seed: of the moments of the kills.
+        hours: of all sittings; at least two cycles are done in each.
+        seed: of the moments of the kills, with the number of the sitting.
     """
-    started, draws = time.monotonic(), random.Random(seed)
+    code = code_digest(Path(__file__), HERE / "steady.py")
+    sittings = _sittings(code)
+    left = hours - sum(one["hours"] for one in sittings)
+    if left <= 0:
+        print(f"{hours:g} hours are done with this code: {RESULT}")
+    else:
+        for sitting in _sitting(left, random.Random(f"{seed} {len(sittings)}")):
+            write_json(RESULT, _published(code, [*sittings, sitting]))
+    facts = json.loads(RESULT.read_text())
+    print(json.dumps(facts, indent=2))
+    return int(bool(facts["wrong"]) or not facts["flat"])
+
+
+def _sittings(code: str) -> list[dict[str, Any]]:
+    """Return the sittings of before with this code."""
+    found = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+    sittings: list[dict[str, Any]] = found["sittings"] if found.get("code") == code else []
+    return sittings
+
+
+def _published(code: str, sittings: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what is published: sums over the sittings, and each of them."""
+    return {
+        "hours": round(sum(one["hours"] for one in sittings), 2),
+        "cycles": sum(one["cycles"] for one in sittings),
+        "kills": sum(one["kills"] for one in sittings),
+        "wrong": [wrong for one in sittings for wrong in one["wrong"]],
+        "flat": all(one["flat"] for one in sittings),
+        "code": code,
+        "sittings": sittings,
+    }
+
+
+def _sitting(hours: float, draws: random.Random) -> Iterator[dict[str, Any]]:
+    """Go on for so many hours; yield the facts after each cycle."""
+    started = time.monotonic()
     folder = ROOT / "runs" / "soak"
     shutil.rmtree(folder, ignore_errors=True)
-    facts: dict[str, object] = {}
     with Work(folder) as work:
         case = folder / "case"
         shutil.copytree(work.objects, case / "objects")
@@ -68,11 +108,8 @@ def soak(hours: float, seed: int = 0) -> int:
                 wrong += [f"cycle {cycles}: left {left}"] if left else []
                 rows.append(_answer(steady))
                 cycles += 1
-                facts = _facts(started, cycles, kills, wrong, rows)
-                write_json(ROOT / "results" / "soak.json", facts)
+                yield _facts(started, cycles, kills, wrong, rows)
                 print(f"cycle {cycles}: {kills} kills, {len(wrong)} wrong, {rows[-1]}", flush=True)
-    print(json.dumps(facts, indent=2))
-    return int(bool(facts["wrong"]) or not facts["flat"])
 
 
 def _until_done(work: Work, line: str, case: Path, took: float, draws: random.Random) -> tuple[int, str | None]:
@@ -129,8 +166,8 @@ def _answer(steady: "subprocess.Popen[str]") -> dict[str, int]:
     return answer
 
 
-def _facts(started: float, cycles: int, kills: int, wrong: list[str], rows: list[dict[str, int]]) -> dict[str, object]:
-    """Return what is published."""
+def _facts(started: float, cycles: int, kills: int, wrong: list[str], rows: list[dict[str, int]]) -> dict[str, Any]:
+    """Return what is published of a sitting."""
     quarter = max(len(rows) // 4, 1)
     early = statistics.median(row["memory_kb"] for row in rows[quarter : 2 * quarter] or rows)
     late = statistics.median(row["memory_kb"] for row in rows[-quarter:])
