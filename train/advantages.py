@@ -37,7 +37,7 @@ class CorrectionSettings(LaggedSettings, RegressionSettings):
         False, help="Shift the advantages so that a batch's targets agree with Q on average; no correction is left."
     )
     look_in_mirror: bool = setting(
-        True, help="Let the online network see the mirror image where it picks and judges, where there is a mirror."
+        False, help="Let the online network see the mirror image where it picks and judges, where there is a mirror."
     )
 
 

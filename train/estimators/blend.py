@@ -138,7 +138,7 @@ row = Estimator(
         needs_return=False,
     ),
     action_selection=StochasticSearch(),
-    paper=BlendSettings(loss="squared", look_in_mirror=False),
+    paper=BlendSettings(loss="squared"),
     update=measured_regression,
     kept=nothing_measured,
 )

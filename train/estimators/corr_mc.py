@@ -46,10 +46,9 @@ def target(
 
     Source: Quillen et al. 2018, section "Corrected Monte Carlo Evaluation".
     Differs: 1. Q of an advantage is a constant of the loss; the released code lets gradient through it (`--judge
-    online-gradient`, with `--preset paper`). 2. θ looks at the mirror image where it picks and judges
-    (`--no-look-in-mirror` with `--preset paper`). 3. ν rises over half of the training; over a twentieth with `--preset
-    paper`, which is the released code's 100,000 of 2 million steps; the text says "during training". 4. A batch counts
-    transitions; in the released code 32 counts episodes (`--batch-of episodes`, with `--preset paper`). 5. The lagged
+    online-gradient`, with `--preset paper`). 2. ν rises over half of the training; over a twentieth with `--preset
+    paper`, which is the released code's 100,000 of 2 million steps; the text says "during training". 3. A batch counts
+    transitions; in the released code 32 counts episodes (`--batch-of episodes`, with `--preset paper`). 4. The lagged
     network is copied every 50 steps, the paper's text for `dql`; every 100 in the released code, and with `--preset
     paper`.
     """
@@ -107,9 +106,7 @@ row = Estimator(
         "corrected episode value, coefficient nu annealed 0 -> 1", target, view="episodes", needs_return=False
     ),
     action_selection=StochasticSearch(),
-    paper=CorrMcSettings(
-        loss="squared", lag_steps=100, anneal=0.05, judge="online-gradient", look_in_mirror=False, batch_of="episodes"
-    ),
+    paper=CorrMcSettings(loss="squared", lag_steps=100, anneal=0.05, judge="online-gradient", batch_of="episodes"),
     paper_recipe=dataclasses.replace(PAPER, learning_rate=1e-4),
     update=corrected_regression,
 )

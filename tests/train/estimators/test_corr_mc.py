@@ -46,8 +46,7 @@ def networks(lagged: QNetwork, network: QNetwork | None = None) -> Networks:
 
 
 def settings(**given: Any) -> CorrMcSettings:
-    plain: dict[str, Any] = {"look_in_mirror": False}
-    return CorrMcSettings(**plain | given)
+    return CorrMcSettings(**given)
 
 
 def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> LaterValues:
