@@ -110,13 +110,14 @@ class Trial:
             for found in finished_below(run.folder / "evaluations"):
                 if self._is_asked(found.summary):
                     return State(self, steps, seconds, found, None)
-        failed = self.failure_note.exists()
-        reason = self._failure() if failed else None
-        return State(self, steps, seconds, None, reason)
+        return State(self, steps, seconds, None, self._failure(steps))
 
-    def _failure(self) -> str:
+    def _failure(self, steps: int) -> str | None:
+        if not self.failure_note.exists():
+            return None
         note = read_checked_json(self.failure_note, "note of a failure", "delete it, and the trial is done again")
-        return str(note.get("reason"))
+        of_a_run_that_is_gone = steps < note.get("steps", 0)
+        return None if of_a_run_that_is_gone else str(note.get("reason"))
 
     def _is_asked(self, summary: dict[str, Any]) -> bool:
         """Return whether an evaluation is of the last step and on the sweep's scenes."""
@@ -201,8 +202,9 @@ class Trial:
             raise UserError(reason)
 
     def note_failure(self, command: str, exit_status: int, reason: str) -> None:
-        """Note durably that it failed."""
+        """Note durably that it failed; the note is void once the run is deleted that it is of."""
         note = {"id": self.name, "command": command, "exit_status": exit_status, "reason": reason}
+        note["steps"] = trained_steps(run_in(self.run_folder))
         write_checked_json(self.failure_note, note)
 
 

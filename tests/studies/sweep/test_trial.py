@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from typing import Any
 
 import pytest
@@ -107,6 +108,15 @@ def test_a_failure_keeps_its_reason_until_the_job_is_done_all_the_same(trials: l
     write.scored(trial, 3)
     assert (trial.state().status, trial.state().reason) == ("done", None)
     assert trial.failure_note.exists()
+
+
+def test_a_run_that_is_deleted_takes_the_note_of_its_failure_with_it(trials: list[Trial], write: Any) -> None:
+    trial = trials[0]
+    write.trained(trial, 50)
+    trial.note_failure(command="grasp-train", exit_status=2, reason="dql diverged at step 57")
+    assert trial.state().status == "failed"
+    shutil.rmtree(trial.run_folder)
+    assert trial.state().status == "to do"
 
 
 def test_training_seconds_are_those_of_the_steps_that_count(trials: list[Trial], write: Any) -> None:
