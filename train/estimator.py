@@ -18,7 +18,7 @@ from graspq.train.acting import ActionSelection
 from graspq.train.batch import Batch
 from graspq.train.networks import Parts, q_network
 from graspq.train.networks.network import Link
-from graspq.train.recipe import PAPER, Recipe
+from graspq.train.recipe import DEFAULT, PAPER, Recipe
 from graspq.train.state import Networks, TrainState
 
 Metrics = dict[str, Tensor]
@@ -184,6 +184,7 @@ class Estimator(Generic[S]):
         target_value: what Q is regressed onto.
         action_selection: how its policy finds an action; training never asks.
         paper: its options with `--preset paper`.
+        recipe: the common options, where this estimator was measured to learn better with others.
         paper_recipe: the common options with `--preset paper`, where the authors' code has others for this estimator.
         regressed_action: the action whose Q is regressed onto the target, float [B, T, A]; the logged one.
         loss: own settings -> the loss; that of `LOSSES` which they name.
@@ -198,6 +199,7 @@ class Estimator(Generic[S]):
     target_value: TargetValue[S]
     action_selection: ActionSelection
     paper: S
+    recipe: Recipe = DEFAULT
     paper_recipe: Recipe = PAPER
     regressed_action: Callable[[Batch], Tensor] = lambda batch: batch.action
     loss: Callable[[S], Loss] = chosen_loss
@@ -205,6 +207,10 @@ class Estimator(Generic[S]):
     kept: Callable[[ShardPool, S], dict[str, Tensor]] = lambda pool, settings: {}
     update: Callable[["Estimator[S]", TrainState, Batch, S, torch.Generator, float], Metrics] = regression
     objective: Callable[["Estimator[S]", Batch, Networks, S, torch.Generator, float], Tensor] = regression_objective
+
+    def recipe_of(self, preset: str) -> Recipe:
+        """Return the common options of a preset, `default` or `paper`."""
+        return self.paper_recipe if preset == "paper" else self.recipe
 
     def parts_of(self, settings: S) -> Parts:
         """Return the networks of a run with these settings."""

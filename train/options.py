@@ -10,7 +10,7 @@ from graspq.common.options import Command, Settings, parameters, shown_value
 from graspq.train.estimator import Estimator
 from graspq.train.estimators import ESTIMATORS, estimator_named
 from graspq.train.networks import network_named
-from graspq.train.recipe import PAPER, Recipe
+from graspq.train.recipe import Recipe
 from graspq.train.settings import TrainSettings, refuse_taken_names, unknown_option
 
 # Common options that stand before `--preset`: what is trained, on what, where to.
@@ -82,20 +82,19 @@ def value_of(option: str, words: Sequence[str]) -> str | None:
 
 def _chosen(words: Sequence[str]) -> tuple[str | None, str]:
     """Return the values of `--algo` and `--network` in a command line, as they decide which options there are."""
-    algo, recipe = value_of("--algo", words), Recipe()
-    if value_of("--preset", words) == "paper":
-        recipe = estimator_named(algo).paper_recipe if algo is not None else PAPER
-    return algo, value_of("--network", words) or recipe.network
+    algo, network, preset = (value_of(option, words) for option in ("--algo", "--network", "--preset"))
+    row = estimator_named(algo) if algo is not None else Estimator
+    return algo, network or (row.paper_recipe if preset == "paper" else row.recipe).network
 
 
 def common_parameters(estimator: Estimator[Any] | None = None) -> list[click.Parameter]:
     """Return the common options of training for a command line; the help shows what either preset gives.
 
     Args:
-        estimator: whose values the paper's preset gives, where it is known.
+        estimator: whose values they are, where it is known.
     """
-    paper = estimator.paper_recipe if estimator is not None else Estimator.paper_recipe
-    shown = _shown(Recipe(), paper)
+    row = estimator if estimator is not None else Estimator
+    shown = _shown(row.recipe, row.paper_recipe)
     first = (*FIRST, *(field.name for field in dataclasses.fields(Recipe)))
     order = {name: index for index, name in enumerate(first)}
     found = parameters(TrainSettings, shown)

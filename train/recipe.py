@@ -78,6 +78,8 @@ class Recipe(Settings):
         return self.steps
 
 
+DEFAULT = Recipe()
+
 # Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
 PAPER = Recipe(
     steps=2_000_000,

@@ -110,7 +110,7 @@ def complete(given: Mapping[str, Any], preset: Preset = "default") -> TrainSetti
     if "algo" not in given:
         raise UserError(f"--algo: expected an estimator: {', '.join(ESTIMATORS)}, or module:row of your own")
     estimator = estimator_named(given["algo"])
-    recipe = estimator.paper_recipe if preset == "paper" else Recipe()
+    recipe = estimator.recipe_of(preset)
     network = given.get("network", recipe.network)
     own, network_own = estimator.paper if preset == "paper" else estimator.settings(), network_named(network).settings()
     refuse_taken_names(given["algo"], network)

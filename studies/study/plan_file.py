@@ -16,7 +16,6 @@ from graspq.studies.sweep.grid import MOST_TRIALS
 from graspq.studies.sweep.settings import SET_BY_SWEEP
 from graspq.studies.sweep.trial import Options
 from graspq.train.estimators import estimator_named
-from graspq.train.recipe import Recipe
 
 OFF_POLICY, ON_POLICY = "off-policy", "on-policy"
 # What a plan may say: its key, its kinds, what is taken where it is not said, what was expected.
@@ -160,8 +159,7 @@ def _rows(entry: Any, values: Mapping[str, Any]) -> Iterator[Row]:
     algo, name = own.pop("algo"), own.pop("name", None)
     preset = own.get("preset", values["preset"])
     estimator = estimator_named(algo)
-    recipe = estimator.paper_recipe if preset == "paper" else Recipe()
-    asked = own.pop("steps", values["steps"] or recipe.steps)
+    asked = own.pop("steps", values["steps"] or estimator.recipe_of(preset).steps)
     steps = None if asked is None else parse_count(str(asked))
     taken = sorted({*own, *values["options"]} & SET_BY_SWEEP)
     if taken:

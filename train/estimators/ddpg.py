@@ -27,7 +27,7 @@ class DdpgSettings(LaggedSettings, RegressionSettings):
     actor_rest: float = setting(
         0.2, help="Part of the steps in which the actor stays as it began, while Q learns.", minimum=0, maximum=1
     )
-    actor_rate: float = setting(0.1, help="Learning rate of the actor over that of Q.", minimum=0, maximum=10)
+    actor_rate: float = setting(0.3, help="Learning rate of the actor over that of Q.", minimum=0, maximum=10)
     actor_every: int = setting(2, help="Steps of Q from one step of the actor to the next.", minimum=1)
 
 

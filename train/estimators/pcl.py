@@ -16,7 +16,7 @@ from graspq.train.acting import ActorNetwork
 from graspq.train.batch import Batch
 from graspq.train.estimator import LOSSES, EpisodeSettings, Estimator, LaggedSettings, Metrics, TargetValue
 from graspq.train.networks import state_network
-from graspq.train.recipe import PAPER
+from graspq.train.recipe import DEFAULT, PAPER
 from graspq.train.selection import pointed
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import path_consistent
@@ -240,6 +240,7 @@ row = Estimator(
     ),
     action_selection=ActorNetwork(),
     paper=PclSettings(discount=0.95, actor_rate=1.0, path_steps=10, penalty=3.0, batch_of="episodes"),
+    recipe=dataclasses.replace(DEFAULT, learning_rate=1e-3),
     paper_recipe=dataclasses.replace(PAPER, learning_rate=1e-4, batch_size=64),
     loss=lambda settings: LOSSES["squared"],
     parts={"v": state_network(1), "actor": state_network(lambda specification: 2 * specification.actions)},

@@ -46,7 +46,7 @@ def networks(lagged: QNetwork, network: QNetwork | None = None) -> Networks:
 
 
 def settings(**given: Any) -> CorrMcSettings:
-    return CorrMcSettings(**given)
+    return CorrMcSettings(**{"discount": 0.9} | given)
 
 
 def seen_by(batch: Batch, given: Networks, chosen: CorrMcSettings) -> LaterValues:
