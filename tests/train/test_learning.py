@@ -1,7 +1,8 @@
 """Every estimator learns what it ought to on stochastic processes that are solved exactly; see `tiny_mdp.py`.
 
 Off-policy data, 15 steps, an action that waits, good paths by luck alone; options as they ship, but for the number of
-steps, rate and lag of networks this small, and for the process's discount of 0.9. Each is held to its own fixed point, nearer than the others are to it.
+steps, rate and lag of networks this small, and for the process's discount of 0.9. Each is held to its own fixed point,
+nearer than the others are to it.
 `pcl` learns on a mirrored process of two places and uniform actions: where what follows is uncertain, the square of a
 residual is not least at the optimum (see `pcl`, Bias), and no tolerance would mean much.
 """
@@ -146,7 +147,7 @@ def test_what_no_picture_shows_reaches_a_corrected_return_and_one_of_enough_step
     algo: str, own: dict[str, Any], learned_from: str, preset: Preset, seed: int, hidden: tiny_mdp.Data
 ) -> None:
     """So a corr-mc that bootstraps, one that corrects nothing, and a one-step nstep each miss the others' values."""
-    state = learned(algo, hidden, preset=preset, seed=seed, steps=240, lag_steps=10, **own)
+    state = learned(algo, hidden, preset=preset, seed=seed, steps=320, lag_steps=10, **own)
     action = torch.zeros(1, 2, 4)
     action[0, :, 0] = torch.tensor([-0.5, 0.5])
     with torch.no_grad():
@@ -154,7 +155,7 @@ def test_what_no_picture_shows_reaches_a_corrected_return_and_one_of_enough_step
     values = tiny_mdp.hidden_values()
     off = {name: float(np.abs(found - np.array(exact)).max()) for name, exact in values.items()}
     assert off[learned_from] < 0.07, off
-    assert all(distance > 0.12 for name, distance in off.items() if name != learned_from), off
+    assert all(distance > 0.1 for name, distance in off.items() if name != learned_from), off
 
 
 def test_supervised_reaches_the_mean_outcome_given_the_displacement(data: tiny_mdp.Data) -> None:
