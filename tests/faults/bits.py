@@ -45,6 +45,7 @@ class Reading:
         needs: inputs that the command needs.
         flips: how many.
         repairs: the command makes the file again, so that it must be the same afterwards.
+        found: the command is there to find every flip; what it gives does not come from the file.
     """
 
     what: str
@@ -53,16 +54,18 @@ class Reading:
     needs: tuple[str, ...]
     flips: int = 60
     repairs: bool = False
+    found: bool = False
 
 
 READINGS = (
-    Reading("steps table", "data/regular-24/shards/*.parquet", VERIFY, ("dataset",), 120),
-    Reading("episodes table", "data/regular-24/episodes/*.parquet", VERIFY, ("dataset",), 80),
+    Reading("steps table", "data/regular-24/shards/*.parquet", VERIFY, ("dataset",), 120, found=True),
+    Reading("episodes table", "data/regular-24/episodes/*.parquet", VERIFY, ("dataset",), 80, found=True),
     Reading("manifest", "data/regular-24/manifest.json", VERIFY, ("dataset",), 120),
-    Reading("card", "data/regular-24/README.md", VERIFY, ("dataset",), 30),
-    Reading("object set of a dataset", "data/regular-24/objects/object_set.json", VERIFY, ("dataset",), 40),
-    Reading("OBJ of a dataset", "data/regular-24/objects/meshes/*.obj", VERIFY, ("dataset",), 40),
-    Reading("URDF of a dataset", "data/regular-24/objects/meshes/*.urdf", VERIFY, ("dataset",), 40),
+    Reading("card", "data/regular-24/README.md", VERIFY, ("dataset",), 30, found=True),
+    Reading("object set of a dataset", "data/regular-24/objects/object_set.json", VERIFY, ("dataset",), 40,
+            found=True),
+    Reading("OBJ of a dataset", "data/regular-24/objects/meshes/*.obj", VERIFY, ("dataset",), 40, found=True),
+    Reading("URDF of a dataset", "data/regular-24/objects/meshes/*.urdf", VERIFY, ("dataset",), 40, found=True),
     Reading("steps table, trained on", "data/regular-24/shards/*.parquet", TRAIN, ("dataset",), 20),
     Reading("manifest, trained on", "data/regular-24/manifest.json", TRAIN, ("dataset",), 20),
     Reading("object set", "objects/object_set.json", SET, ("objects",), 80),
@@ -190,7 +193,7 @@ def _judged(one: Reading, path: Path, before: Ran, ran: Ran, whole: dict[str, st
     if broken is not None:
         return broken
     names_it = path.name in ran.stderr
-    if ran.rc != 0:
+    if ran.rc != 0 or one.found:
         return ran.refused(path.name)
     if now != whole:
         differing = [name for name in {**whole, **now} if whole.get(name) != now.get(name)]

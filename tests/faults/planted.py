@@ -201,7 +201,7 @@ PLANTED = [
         "two commands on one folder",
         ("grasp-train",),
         0,
-        ("trainings of two seeds",),
+        ("a training twice",),
     ),
     Planted(
         "a stream that is closed stays closed",

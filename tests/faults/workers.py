@@ -56,6 +56,12 @@ class Workers:
             running = Running(work, line.words, case, env)
             running.until(running.workers)
             _do(fault.name, running)
+            if fault.name == "the command killed":
+                running.process.wait()
+                met = line.goes_on(case, work, env)  # while its workers are still ending
+                if met.outcome != "survived":
+                    running.ended()
+                    return met
             ended = running.ended()
             wrong = _wrong(fault.name, ended)
             if wrong is not None:
