@@ -3,6 +3,7 @@
 import os
 import resource
 import signal
+import tempfile
 import time
 from collections.abc import Iterable
 from dataclasses import replace
@@ -48,11 +49,9 @@ class Workers:
         """Do it to the first worker that there is, see how the command ends, and run it again."""
         line = LINES[fault.command]
         work.made("objects")
-        with line.case(work) as case:
-            # A folder for temporary files of its own, where leftovers are seen.
-            temporary = case / "t"
-            temporary.mkdir()
-            env = {"TMPDIR": str(temporary)}
+        # A folder for temporary files of its own, where leftovers are seen; a short name, as sockets need it.
+        with line.case(work) as case, tempfile.TemporaryDirectory(prefix="faults-", dir="/tmp") as own:
+            temporary, env = Path(own), {"TMPDIR": own}
             running = Running(work, line.words, case, env)
             running.until(running.workers)
             _do(fault.name, running)
