@@ -201,7 +201,7 @@ PLANTED = [
         "two commands on one folder",
         ("grasp-train",),
         0,
-        ("a training twice",),
+        ("a training twice, at once",),
     ),
     Planted(
         "a stream that is closed stays closed",

@@ -25,7 +25,8 @@ from tests.faults.commands import (
 from tests.faults.harness import Fault, Tried, Work
 
 SMALLER = replace(DATAGEN, words=(DATAGEN.words[0], "16", *DATAGEN.words[2:]), made="")
-DELAYS = (0.0, 0.4, 1.2)  # after the first has begun to write
+# When the second starts, seconds after the first has begun to write; or with the first, so that they certainly meet.
+DELAYS: dict[str, float | None] = {"at once": None, "0 s": 0.0, "0.4 s": 0.4, "1.2 s": 1.2}
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Pair:
 
     Attributes:
         first: begins.
-        second: begins when the first has begun to write, and a while after.
+        second: begins with the first, or when that has begun to write, and a while after.
         grown: how the folder is made ready, from inputs: a command that runs before both.
         refused: whether the second must refuse if it meets the first.
     """
@@ -79,16 +80,16 @@ class Together:
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return each pair with each delay."""
         for pair in SHORT if short else PAIRS:
-            for delay in DELAYS[:1] if short else DELAYS:
-                yield Fault(self.name, PAIRS[pair].first.name, f"{pair}, {delay:g} s")
+            for delay in ("0 s",) if short else DELAYS:
+                yield Fault(self.name, PAIRS[pair].first.name, f"{pair}, {delay}")
 
     def tried(self, fault: Fault, work: Work) -> Tried:
         """Run both, then the first again."""
         name, _, delay = fault.name.rpartition(", ")
-        return _together(PAIRS[name], float(delay.split()[0]), work)
+        return _together(PAIRS[name], DELAYS[delay], work)
 
 
-def _together(pair: Pair, delay: float, work: Work) -> Tried:
+def _together(pair: Pair, delay: float | None, work: Work) -> Tried:
     needs = tuple(dict.fromkeys((*pair.first.needs, *pair.second.needs)))
     if pair.first.result == "data/regular-24":
         needs = pair.first.needs
@@ -96,8 +97,9 @@ def _together(pair: Pair, delay: float, work: Work) -> Tried:
         if pair.grown is not None:
             work.forked(pair.grown.words, case)
         first = Running(work, pair.first.words, case)
-        first.until(_writing(case / pair.first.result))
-        time.sleep(delay)
+        if delay is not None:
+            first.until(_writing(case / pair.first.result))
+            time.sleep(delay)
         second = Running(work, pair.second.words, case)
         ended, met = first.ended(), second.ended()
         for ran in (ended, met):
