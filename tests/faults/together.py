@@ -47,6 +47,8 @@ class Pair:
 
 
 _EVAL_RUN = replace(EVAL, needs=("dataset",))
+# Both may stand in one folder: it is the first's own place that must be as ever.
+_EVAL_0 = replace(EVAL, result=f"{EVAL.result}/mc-regular-validation-seed0-4")
 _OTHER_SEED = replace(OBJECTS, words=(*OBJECTS.words, "--seed", "7"), made="")
 PAIRS = {
     "the same objects": Pair(OBJECTS, OBJECTS),
@@ -62,7 +64,7 @@ PAIRS = {
     "a training and its evaluation": Pair(TRAIN, _EVAL_RUN),
     "a training and a report": Pair(TRAIN, Line(("grasp-report", "runs", "--out", "report.html"), ())),
     "an evaluation twice": Pair(EVAL, EVAL),
-    "evaluations of two seeds": Pair(EVAL, replace(EVAL, words=(*EVAL.words, "--seed", "1"), made="")),
+    "evaluations of two seeds": Pair(_EVAL_0, replace(EVAL, words=(*EVAL.words, "--seed", "1"), made="")),
     "a sweep twice": Pair(SWEEP, SWEEP),
     "a sweep and a report": Pair(SWEEP, Line(("grasp-report", "sweep", "--out", "report.html"), ())),
     "a study twice": Pair(STUDY, STUDY),
