@@ -83,8 +83,9 @@ def next_interrupt_ends_at_once() -> None:
 
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM, as schedulers and containers send it, end what runs here as a Ctrl-C does: it raises
-    KeyboardInterrupt, so that workers are ended and folders removed; without effect where somebody handles it.
+    """Let SIGTERM, as schedulers and containers send it, raise KeyboardInterrupt here, as a Ctrl-C does.
+
+    So workers are ended and folders removed. Without effect where somebody handles it.
     """
     ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if ours:

@@ -204,8 +204,7 @@ class Trial:
     def note_failure(self, command: str, exit_status: int, reason: str) -> None:
         """Note durably that it failed; the note is void once the run is deleted that it is of."""
         note = {"id": self.name, "command": command, "exit_status": exit_status, "reason": reason}
-        note["steps"] = trained_steps(run_in(self.run_folder))
-        write_checked_json(self.failure_note, note)
+        write_checked_json(self.failure_note, note | {"steps": trained_steps(run_in(self.run_folder))})
 
 
 def run_in(folder: Path) -> Run | None:

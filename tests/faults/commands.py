@@ -128,12 +128,9 @@ def essence(place: Path) -> dict[str, Any]:
 def with_checkpoints_of(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     """Return an essence without the checkpoints that the other lacks: each run's last stays, and their number."""
     ours, theirs = _checkpoints(one), _checkpoints(other)
-    kept = {name: value for name, value in one.items() if _CHECKPOINT.match(name) is None}
-    for run, steps in ours.items():
-        shared = steps & theirs.get(run, set()) | {max(steps)}
-        kept |= {name: value for name, value in one.items() if _place(name) in {(run, step) for step in shared}}
-        kept[run] = len(steps)
-    return kept
+    kept = {(run, step) for run, steps in ours.items() for step in steps & theirs.get(run, set()) | {max(steps)}}
+    left = {name: value for name, value in one.items() if _place(name) in kept | {None}}
+    return left | {run: len(steps) for run, steps in ours.items()}
 
 
 def _checkpoints(found: Iterable[str]) -> dict[str, set[int]]:

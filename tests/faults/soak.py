@@ -48,7 +48,7 @@ def soak(hours: float, seed: int = 0) -> int:
     code = code_digest(Path(__file__), HERE / "steady.py")
     sittings = _sittings(code)
     left = hours - sum(one["hours"] for one in sittings)
-    if left <= 0:
+    if sittings and left <= 0:
         print(f"{hours:g} hours are done with this code: {RESULT}")
     else:
         for sitting in _sitting(left, random.Random(f"{seed} {len(sittings)}")):

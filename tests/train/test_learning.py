@@ -107,7 +107,7 @@ FIXED_POINTS: dict[str, tuple[Callable[[], tiny_mdp.Floats], float, Callable[[],
 def test_an_estimator_reaches_its_own_fixed_point_and_no_other(algo: str, data: tiny_mdp.Data) -> None:
     own, near, wrong = FIXED_POINTS[algo]
     given = {
-        "ddpg": {"actor_rate": 1.0},  # 500 steps are few for an actor at a tenth of Q's rate
+        "ddpg": {"actor_rate": 1.0},  # 500 steps are few for an actor at 0.3 of Q's rate
         "td3-bc": {"alpha": 10.0},  # uniform actions are not worth cloning
         "mc": {"discount": 0.9},
     }

@@ -63,7 +63,7 @@ def actor_critic(
     Source: Quillen et al. 2018, section "Deep Deterministic Policy Gradient".
     Differs: 3. An action lies in the box [-1, 1]ᴬ that the data fill, see `selection.pointed`; the released actor is
     unbounded. 4. The actor starts where a search starts. With `--preset paper` all is undone of: 5. it rests at the
-    start (`--actor-rest`); 6. its rate is a tenth of Q's (`--actor-rate`), as in Lillicrap et al. 2015; 7. it takes a
+    start (`--actor-rest`); 6. its rate is 0.3 of Q's (`--actor-rate`; Lillicrap et al. 2015: a tenth); 7. it takes a
     step after every second of Q (`--actor-every`), as in Fujimoto et al. 2018.
     """
     metrics = regression(estimator, state, batch, settings, random, progress)
