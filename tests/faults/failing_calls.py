@@ -5,9 +5,10 @@ The command must say so in one line that names a file or folder of its own, and 
 
 import errno
 import os
+import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from tests.faults.harness import Fault, Ran, Tried, Work
 from tests.faults.system_calls import (
     CREATE,
     FAIL,
+    FAIL_FILE,
     FAIL_ON,
     FSYNC,
     MAKES,
@@ -26,6 +28,7 @@ from tests.faults.system_calls import (
     READ,
     RENAME,
     WRITE,
+    Call,
     Scenario,
     Stage,
     armed,
@@ -35,7 +38,7 @@ from tests.faults.system_calls import (
 )
 
 NO_MEMORY = "not enough memory"  # of which no file is the cause
-MOST = 12  # of each kind and command, evenly spread
+MOST = 12  # of each kind and command, evenly spread; more where they would miss a file
 IN_SHORT = ("EIO in write", "ENOSPC in open")  # the kinds that `make test` tries
 
 
@@ -59,7 +62,7 @@ def judged(ran: Ran, scenario: Scenario, stage: Stage, case: Path, again: Ran | 
 
 @dataclass
 class FailingCalls:
-    """The N-th of some calls fails, or that and all later ones."""
+    """The N-th of some calls fails alone, or with all later ones, or with the later ones on the same file."""
 
     name: str
     calls: int
@@ -69,8 +72,9 @@ class FailingCalls:
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return one for some of the calls of each command."""
         for scenario in scenarios(work, short, MAKES if self.name in IN_SHORT else None):
-            count = stage_of(work).unbroken(scenario).count(self.calls)
-            for number in few(range(1, count + 1), 1 if short else MOST):
+            met = [call for call in stage_of(work).unbroken(scenario).calls if call.what & self.calls]
+            numbers = few(range(1, len(met) + 1), 1) if short else _of_each_file(met)
+            for number in numbers:
                 yield Fault(self.name, scenario.command, f"{number}")
 
     def tried(self, fault: Fault, work: Work) -> Tried:
@@ -83,10 +87,24 @@ class FailingCalls:
             return judged(ran, scenario, stage, case, again)
 
 
+def _of_each_file(calls: Sequence[Call]) -> list[int]:
+    """Return the numbers of calls to fail, from 1: the first on each file, and others, evenly spread, up to `MOST`.
+
+    Files whose names differ in numbers alone, as those of steps, blocks and processes do, count as one.
+    """
+    first: dict[str, int] = {}
+    for number, call in enumerate(calls, 1):
+        first.setdefault(re.sub(r"\d+", "0", call.path), number)
+    spread = few(range(1, len(calls) + 1), max(MOST - len(first), 0))
+    return sorted({*first.values(), *spread})
+
+
 def failing_calls() -> list[FailingCalls]:
     """Return a kind for each call and error."""
-    once = {"write": WRITE, "fsync": FSYNC, "rename": RENAME, "open": OPEN | CREATE, "read": READ}
-    kinds = [FailingCalls(f"EIO in {name}", calls, errno.EIO) for name, calls in once.items()]
+    calls_of = {"write": WRITE, "fsync": FSYNC, "rename": RENAME, "open": OPEN | CREATE, "read": READ}
+    # A bad place of a disk stays bad; of a write that is tried again at once it would be nothing.
+    bad = {"write": FAIL_FILE, "read": FAIL_FILE}
+    kinds = [FailingCalls(f"EIO in {name}", calls, errno.EIO, bad.get(name, FAIL)) for name, calls in calls_of.items()]
     # A disk that is full stays so.
     full = {"write": WRITE, "fsync": FSYNC, "rename": RENAME, "open": CREATE | MKDIR}
     return kinds + [FailingCalls(f"ENOSPC in {name}", calls, errno.ENOSPC, FAIL_ON) for name, calls in full.items()]

@@ -221,7 +221,7 @@ PLANTED = [
         "workers",
         ("grasp-sweep",),
         0,
-        ("the command killed",),
+        ("the command killed, its worker slow",),
     ),
     Planted(
         "temporary folders of killed processes are not swept",

@@ -21,11 +21,12 @@
 #include <sys/uio.h>
 #include <unistd.h>
 
-enum { OFF, NOTE, KILL, KILL_HALF, FAIL, FAIL_ON };            /* FAIL_ON: that call and all later ones */
+enum { OFF, NOTE, KILL, KILL_HALF, FAIL, FAIL_ON, FAIL_FILE }; /* FAIL_ON: that call and all later ones; FAIL_FILE: those on the same file */
 enum { WRITE = 1, FSYNC = 2, RENAME = 4, CREATE = 8, OPEN = 16, READ = 32, REMOVE = 64, MKDIR = 128, TRUNCATE = 256, LINK = 512, SAID = 1024 };
 #define CHANGES (WRITE | FSYNC | RENAME | CREATE | REMOVE | MKDIR | TRUNCATE | LINK)
 
 static struct { int mode, error, log; long at, count; pid_t process; unsigned calls; size_t length; char under[PATH_MAX]; } armed = {.log = -1};
+static char bad[PATH_MAX]; /* the file of FAIL_FILE */
 static pthread_mutex_t order = PTHREAD_MUTEX_INITIALIZER;
 
 #define REAL(result, name, ...) static result (*real)(__VA_ARGS__); if (!real) real = dlsym(RTLD_NEXT, #name)
@@ -35,7 +36,7 @@ void graspq_arm(const char *under, int mode, long at, int error, const char *log
     snprintf(armed.under, sizeof armed.under, "%s/", under);
     armed.length = strlen(armed.under);
     armed.at = at, armed.error = error, armed.calls = calls, armed.count = 0, armed.process = getpid();
-    armed.mode = mode;
+    armed.mode = mode, bad[0] = 0;
 }
 
 static int ours(void) { return armed.mode != OFF && getpid() == armed.process; }
@@ -73,12 +74,13 @@ static void put(int op, long result, long place, const char *a, const char *b, c
 
 /* Count a call; 0: go on, 1: fail with errno set, 2: do half of it and then call `die`. */
 static void die(void) { syscall(SYS_kill, getpid(), SIGKILL); for (;;) pause(); }
-static int met(int op) {
+static int met(int op, const char *name) {
     if (!(op & armed.calls)) return 0;
     long number = ++armed.count;
     if (armed.mode == KILL && number == armed.at) die();
     if (armed.mode == KILL_HALF && number == armed.at) { if (op == WRITE) return 2; die(); }
-    if ((armed.mode == FAIL && number == armed.at) || (armed.mode == FAIL_ON && number >= armed.at)) { errno = armed.error; return 1; }
+    if (armed.mode == FAIL_FILE && number == armed.at) strcpy(bad, name);
+    if ((armed.mode == FAIL && number == armed.at) || (armed.mode == FAIL_ON && number >= armed.at) || (armed.mode == FAIL_FILE && bad[0] && !strcmp(bad, name))) { errno = armed.error; return 1; }
     return 0;
 }
 
@@ -92,7 +94,7 @@ static int opened(int folder, const char *path, int flags, mode_t mode) {
     int changes = (flags & (O_CREAT | O_TRUNC)) && (flags & O_TMPFILE) != O_TMPFILE, op = changes ? CREATE : OPEN;
     LOCK;
     int result = -1;
-    if (met(op) != 1) {
+    if (met(op, name) != 1) {
         struct stat before;
         int there = fstatat(folder, path, &before, 0) == 0;
         result = syscall(SYS_openat, folder, path, flags, mode);
@@ -115,7 +117,7 @@ static int reads_refused(const char *path, const char *how) {
     char name[PATH_MAX];
     if (!ours() || how[0] != 'r' || (whole(AT_FDCWD, path, name), !name[0])) return 0;
     LOCK;
-    int refused = met(OPEN) == 1;
+    int refused = met(OPEN, name) == 1;
     if (!refused) put(OPEN, 0, 0, name, 0, 0, 0);
     UNLOCK;
     return refused;
@@ -140,7 +142,7 @@ static ssize_t wrote(int file, const void *data, size_t size, long place) {
     if (!name[0]) return DO(size);
     LOCK;
     ssize_t result = -1;
-    int what = met(WRITE);
+    int what = met(WRITE, name);
     if (what == 2) { DO(size / 2); die(); }
     if (!what) {
         long at = place < 0 ? place_of(file) : place;
@@ -162,7 +164,7 @@ static ssize_t read_some(int file, void *data, size_t size, long place) {
     if (!ours() || !(armed.calls & READ) || (whole(file, "", name), !name[0])) return GET;
     LOCK;
     ssize_t result = -1;
-    if (!met(READ)) { result = GET; int kept = errno; put(READ, 0, 0, name, 0, 0, 0); errno = kept; }
+    if (!met(READ, name)) { result = GET; int kept = errno; put(READ, 0, 0, name, 0, 0, 0); errno = kept; }
     UNLOCK;
     return result;
 }
@@ -175,7 +177,7 @@ static ssize_t sent(int to, int from, off_t *place, size_t size) {
     if (!ours() || (whole(to, "", name), !name[0])) return syscall(SYS_sendfile, to, from, place, size);
     LOCK;
     ssize_t result = -1;
-    int what = met(WRITE);
+    int what = met(WRITE, name);
     if (what == 2) { syscall(SYS_sendfile, to, from, place, size / 2); die(); }
     if (!what) {
         long at = place_of(to);
@@ -210,7 +212,7 @@ ssize_t copy_file_range(int a, off64_t *b, int c, off64_t *d, size_t e, unsigned
     if (!name[0] && !other[0]) return syscall(__VA_ARGS__); \
     LOCK; \
     int result = -1; \
-    if (met(op) != 1) { result = syscall(__VA_ARGS__); int kept = errno; put(op, result < 0 ? -1 : 0, place, name, other, 0, 0); errno = kept; } \
+    if (met(op, name) != 1) { result = syscall(__VA_ARGS__); int kept = errno; put(op, result < 0 ? -1 : 0, place, name, other, 0, 0); errno = kept; } \
     UNLOCK; \
     return result;
 #define NONE ((const char *)0)

@@ -15,7 +15,7 @@ from typing import Any
 from tests.faults.harness import HERE, PLAN, TRAINING, Ran, Work, digest_of
 
 # As in shim.c.
-OFF, NOTE, KILL, KILL_HALF, FAIL, FAIL_ON = range(6)
+OFF, NOTE, KILL, KILL_HALF, FAIL, FAIL_ON, FAIL_FILE = range(7)
 WRITE, FSYNC, RENAME, CREATE, OPEN, READ, REMOVE, MKDIR, TRUNCATE, LINK, SAID = (1 << bit for bit in range(11))
 CHANGES = WRITE | FSYNC | RENAME | CREATE | REMOVE | MKDIR | TRUNCATE | LINK
 NEVER = 0

@@ -4,6 +4,7 @@ import os
 import resource
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Iterable
 from dataclasses import replace
@@ -27,11 +28,13 @@ def _with_workers(line: Line) -> Line:
 LINES = {line.name: line for line in (COLLECT, *map(_with_workers, (EVAL, SWEEP, STUDY)))}
 FAULTS = (
     "SIGKILL at once", "SIGKILL later", "SIGKILL twice", "SIGSEGV", "SIGTERM", "SIGSTOP for a while",
-    "SIGSTOP and Ctrl-C", "too little memory", "the server killed", "the command killed", "all killed",
+    "SIGSTOP and Ctrl-C", "too little memory", "the server killed", "the command killed",
+    "the command killed, its worker slow", "all killed",
 )  # fmt: skip
 # Failures are noted in their table, and not tried again unless asked.
 NOTING = ("grasp-sweep", "grasp-study")
 LEFT_SECONDS = 20.0
+SLOW_SECONDS = 6.0  # that a worker outlives its command; less than the next start waits for a folder
 
 
 class Workers:
@@ -55,9 +58,9 @@ class Workers:
             running = Running(work, line.words, case, env)
             running.until(running.workers)
             _do(fault.name, running)
-            if fault.name == "the command killed":
+            if fault.name.startswith("the command killed"):
                 running.process.wait()
-                met = line.goes_on(case, work, env)  # while its workers are still ending
+                met = line.goes_on(case, work, env)  # while its worker is still ending
                 if met.outcome != "survived":
                     running.ended()
                     return met
@@ -120,6 +123,13 @@ def _do(what: str, running: Running) -> None:
         case "the command killed":
             time.sleep(1.0)
             running.process.kill()
+        case "the command killed, its worker slow":
+            running.until(lambda: any(map(_holds_a_run, running.workers())), seconds=5.0)
+            workers = running.workers()
+            for worker in workers:
+                _kill(worker, signal.SIGSTOP)
+            running.process.kill()
+            threading.Timer(SLOW_SECONDS, lambda: [_kill(worker, signal.SIGCONT) for worker in workers]).start()
         case "all killed":
             time.sleep(1.0)
             for one in running.descendants():
@@ -134,11 +144,20 @@ def _kill(process: int, number: signal.Signals) -> None:
         return
 
 
+def _holds_a_run(worker: int) -> bool:
+    """Return whether a process has the lock of a training."""
+    try:
+        links = [link.readlink() for link in Path(f"/proc/{worker}/fd").iterdir()]
+        return any(path.match("runs/*/.lock") for path in links)
+    except OSError:
+        return False
+
+
 def _wrong(what: str, ran: Ran) -> Tried | None:
     broken = ran.broken()
     if broken is not None:
         return broken
-    killed = what in ("the command killed", "all killed") and ran.rc == -signal.SIGKILL
+    killed = "killed" in what and "server" not in what and ran.rc == -signal.SIGKILL
     if ran.rc in (0, 1, 130) or killed or one_line(ran):
         return None
     return Tried("lost", f"exit status {ran.rc}: {ran.line}")
