@@ -6,7 +6,7 @@ from typing import Literal, Self
 from graspq.common.options import Settings, parse_count, setting
 
 # The default number of steps for that many grasps, in batches of 256; see `Recipe.for_grasps`.
-USUAL_STEPS, USUAL_GRASPS = 1_500, 10_000
+USUAL_STEPS, USUAL_GRASPS = 1_000, 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Recipe(Settings):
 
     steps: int | None = setting(
         None,
-        help="Gradient steps, such as 8000 or 8k; data: as the amount of data asks, 1,500 for 10,000 grasps.",
+        help="Gradient steps, such as 8000 or 8k; data: as the amount of data asks, 1,000 for 10,000 grasps.",
         minimum=1,
         parse=parse_count,
         none="data",
@@ -61,7 +61,7 @@ class Recipe(Settings):
     def for_grasps(self, count: int) -> Self:
         """Return the recipe with the number of steps for that many grasps, unless it has one.
 
-            steps = 1,500 · (count / 10,000)^⅔ · 256 / batch size,  to the next ten
+            steps = 1,000 · (count / 10,000)^⅔ · 256 / batch size,  to the next ten
 
         More data are worth more steps, and fewer passes. Measurements: docs/networks.md.
         """

@@ -102,8 +102,8 @@ def test_options_that_are_given_win_over_the_preset_even_when_they_are_its_oppos
 
 def test_steps_that_are_not_given_follow_the_number_of_grasps_and_the_batch_size() -> None:
     steps = [given().for_grasps(count).last_step for count in (10, 2_000, 10_000, 80_000)]
-    assert steps == [20, 510, 1_500, 6_000]  # 8 times the grasps: 4 times the steps
-    assert given(batch_size=128).for_grasps(10_000).last_step == 3_000
+    assert steps == [10, 340, 1_000, 4_000]  # 8 times the grasps: 4 times the steps
+    assert given(batch_size=128).for_grasps(10_000).last_step == 2_000
     assert given(steps=7).for_grasps(10_000).last_step == 7
     with pytest.raises(ValueError, match="for_grasps"):
         _ = given().last_step
