@@ -66,7 +66,9 @@ def recolored(image: Tensor, order: Tensor, gain: Tensor, bias: Tensor) -> Tenso
     Returns:
         uint8 [B, T, H, W, 3].
     """
-    pixels = image.reshape(len(image), -1, 3)
-    levels = pixels.gather(2, order.unsqueeze(1).expand_as(pixels)).float()
-    levels = levels.mul_(gain.unsqueeze(1)).add_(bias.unsqueeze(1)).clamp_(0, 255)
-    return levels.to(torch.uint8).view(image.shape)
+    rows = torch.arange(len(image), device=image.device).unsqueeze(1)
+    # A channel at a time: along the last axis, of three, the same work takes twice as long.
+    planes = image.reshape(len(image), -1, 3).transpose(1, 2).flatten(0, 1)
+    levels = planes.index_select(0, (3 * rows + order).flatten()).float()
+    levels = levels.mul_(gain.reshape(-1, 1)).add_(bias.reshape(-1, 1)).clamp_(0, 255).to(torch.uint8)
+    return levels.unflatten(0, (-1, 3)).transpose(1, 2).contiguous().view(image.shape)
