@@ -125,7 +125,7 @@ def test_a_users_own_row_is_found_in_the_working_folder(tmp_path: Path, monkeypa
 
 def test_discounts_are_the_rows_own_the_datasets_or_those_given() -> None:
     for name in set(ESTIMATORS) - {"supervised", "mc"}:
-        assert ESTIMATORS[name].settings().chosen_discount(1.0) == (0.8 if name == "corr-mc" else 0.9)
+        assert ESTIMATORS[name].settings().chosen_discount(1.0) == (0.8 if name in ("corr-mc", "mc-floor") else 0.9)
     assert dql.DqlSettings(discount=0.0).chosen_discount(1.0) == 0.0
     assert [mc.McSettings().chosen_discount(stored) for stored in (1.0, 0.95)] == [1.0, 0.95]
     assert mc.McSettings(discount=0.0).chosen_discount(1.0) == 0.0

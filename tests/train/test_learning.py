@@ -110,6 +110,9 @@ def test_an_estimator_reaches_its_own_fixed_point_and_no_other(algo: str, data: 
         "ddpg": {"actor_rate": 1.0},  # 500 steps are few for an actor at 0.3 of Q's rate
         "td3-bc": {"alpha": 10.0},  # uniform actions are not worth cloning
         "mc": {"discount": 0.9},
+        "mc-floor": {"discount": 0.9},
+        "nstep": {"n": 3},
+        "td-lambda": {"trace_decay": 0.7},
     }
     state = learned(algo, data, **given.get(algo, {}))
     assert distance(state, own()) < near

@@ -45,9 +45,9 @@ OWN: dict[str, dict[str, Any]] = {
     "corr-mc": CORRECTED | {"lag_steps": 100, "anneal": 0.05, "judge": "online-gradient", "batch_of": "episodes"},
     "ddpg": DOUBLE_Q | {"actor_rest": 0.0, "actor_rate": 1.0, "actor_every": 1},
     # Not the paper's: the squared error, and else their defaults.
-    "nstep": DOUBLE_Q | {"candidates": 16, "n": 3},
-    "td-lambda": DOUBLE_Q | {"candidates": 16, "trace_decay": 0.7},
-    "mc-floor": DOUBLE_Q | {"candidates": 16},
+    "nstep": DOUBLE_Q | {"candidates": 16, "n": 2},
+    "td-lambda": DOUBLE_Q | {"candidates": 16, "trace_decay": 0.5},
+    "mc-floor": DOUBLE_Q | {"discount": 0.8, "candidates": 16},
     "iql": DOUBLE_Q | {"expectile": 0.9, "policy": "search", "sharpness": 10.0},
     "td3-bc": DOUBLE_Q | {"alpha": 2.5, "smoothing": 0.2, "smoothing_bound": 0.5, "actor_every": 2},
     # Configuration of the authors' Trust-PCL for grasping.

@@ -24,7 +24,7 @@ class NstepSettings(DqlSettings):
     """Options of `nstep`."""
 
     n: int = setting(
-        3, help="Steps whose rewards count as they were; 1 is dql, that of the longest episode mc.", minimum=1
+        2, help="Steps whose rewards count as they were; 1 is dql, that of the longest episode mc.", minimum=1
     )
 
 

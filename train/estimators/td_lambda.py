@@ -23,7 +23,7 @@ from graspq.train.targets import lambda_return
 class TdLambdaSettings(DqlSettings):
     """Options of `td-lambda`; `lambda` is a word of Python's own."""
 
-    trace_decay: float = setting(0.7, help="Lambda: 0 is dql, 1 is mc with the same discount.", minimum=0, maximum=1)
+    trace_decay: float = setting(0.5, help="Lambda: 0 is dql, 1 is mc with the same discount.", minimum=0, maximum=1)
 
 
 def target(

@@ -44,7 +44,7 @@ def test_each_target_is_the_larger_of_the_bootstrapped_one_and_the_return() -> N
         next_step=torch.arange(1, 5).unsqueeze(1),
     )
     networks = plain_networks({"q": Constant()}, {"q": Constant()})
-    found = mc_floor.target(batch, networks, mc_floor.McFloorSettings(), seeded("tests/draws"), 0.0)
+    found = mc_floor.target(batch, networks, mc_floor.McFloorSettings(discount=0.9), seeded("tests/draws"), 0.0)
     torch.testing.assert_close(found.squeeze(1), torch.tensor([0.81, 0.36, 1.0, 0.0]))
     bootstrapped = dql.target(batch, networks, dql.DqlSettings(), seeded("tests/draws"), 0.0)
     torch.testing.assert_close(bootstrapped.squeeze(1), torch.tensor([0.36, 0.36, 1.0, 0.0]))
