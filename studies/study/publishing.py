@@ -83,7 +83,7 @@ def section(
     """Return the section of a study in Markdown: facts, the table of rows, figures, claims."""
     rows = scored_rows(table)
     scores, *figures = files
-    parts = [f"## Study {study}\n", facts(plan, table, scores), row_table(rows, table, reference)]
+    parts = [f"## Study {study}\n", facts(plan, table, scores, rows), row_table(rows, table, reference)]
     parts += [f"![Success by row of study {study}]({path.as_posix()})\n" for path in figures]
     found = choosing_table(rows)
     if found:
@@ -98,7 +98,7 @@ def section(
     return "\n".join(parts)
 
 
-def facts(plan: Path, table: Table, scores: Path) -> str:
+def facts(plan: Path, table: Table, scores: Path, rows: Rows) -> str:
     """Return the sentences that a table cannot be read without."""
     runs = [one for one in table if one["kind"] == "run"]
     done = [one for one in runs if one["status"] == "done"]
@@ -108,12 +108,18 @@ def facts(plan: Path, table: Table, scores: Path) -> str:
     code = sorted({str(one.get("trained_by"))[:8] for one in done} | {str(one.get("scored_by"))[:8] for one in done})
     data = sorted({str(one.get("data_sha256"))[:12] for one in done})
     objects = sorted({str(one["object_set_sha256"])[:12] for one in done})
+    trainings_each = {len(row.rows) for here in rows.values() for row in here.values()}
+    over = "new training seeds, scenes and objects"
+    if trainings_each == {1}:
+        over = "new scenes and objects, for the one training of each row"
+    elif 1 in trainings_each:
+        over += " (of a row with one training: for that one)"
     chosen = " Choices are made on such scores, which flatters what was chosen."
     if all(one.startswith("test") for one in splits):
         chosen = ""
     return (
         f"`grasp-study run {plan.as_posix()}`: {len(done)} of {len(runs)} trainings, {recipe}, scored on "
-        f"`{'`, `'.join(splits)}`.{chosen} Intervals are 95 %, over new training seeds, scenes and objects; every "
+        f"`{'`, `'.join(splits)}`.{chosen} Intervals are 95 %, over {over}; every "
         f"policy met the same scenes. Data {', '.join(data)}, objects {', '.join(objects)}, code {', '.join(code)}; "
         f"outcome of every grasp: [{scores.as_posix()}]({scores.as_posix()}).\n"
     )

@@ -76,6 +76,21 @@ def test_differences_are_to_the_row_that_the_plan_names() -> None:
     assert "+0.1" in line or "+0.2" in line
 
 
+@pytest.mark.parametrize(
+    ("seeds", "over"),
+    [
+        ((3, 3), "over new training seeds, scenes and objects;"),
+        ((3, 1), "over new training seeds, scenes and objects (of a row with one training: for that one);"),
+        ((1, 1), "over new scenes and objects, for the one training of each row;"),
+    ],
+)
+def test_intervals_are_said_to_hold_for_new_trainings_where_there_are_several(
+    seeds: tuple[int, int], over: str
+) -> None:
+    table = [*runs("dql", 0.9, seeds=seeds[0]), *runs("mc", 0.7, seeds=seeds[1])]
+    assert f"Intervals are 95 %, {over}" in section("s", PLAN, table, [], [Path("s.jsonl")])
+
+
 def test_scores_of_validation_are_named_as_those_that_were_chosen_on(tmp_path: Path) -> None:
     table = [row | {"split": "validation", "recipe_frozen": False} for row in study(dql=0.9)]
     publish("s", PLAN, table, [], tmp_path, tmp_path / "RESULTS.md")
