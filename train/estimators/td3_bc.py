@@ -24,6 +24,7 @@ from graspq.train.estimator import (
 )
 from graspq.train.networks import q_network, state_network
 from graspq.train.networks.network import QNetwork
+from graspq.train.recipe import DEFAULT
 from graspq.train.selection import QOfActions, pointed
 from graspq.train.state import Networks, TrainState
 from graspq.train.targets import bootstrapped
@@ -114,6 +115,7 @@ row = Estimator(
     target_value=TargetValue("bootstrapped (smaller of two critics)", target, needs_next=True, needs_return=False),
     action_selection=ActorNetwork(),
     paper=Td3BcSettings(loss="squared"),
+    recipe=dataclasses.replace(DEFAULT, learning_rate=1e-3),
     parts={
         "q": q_network,
         "twin": q_network,
