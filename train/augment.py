@@ -71,4 +71,4 @@ def recolored(image: Tensor, order: Tensor, gain: Tensor, bias: Tensor) -> Tenso
     planes = image.reshape(len(image), -1, 3).transpose(1, 2).flatten(0, 1)
     levels = planes.index_select(0, (3 * rows + order).flatten()).float()
     levels = levels.mul_(gain.reshape(-1, 1)).add_(bias.reshape(-1, 1)).clamp_(0, 255).to(torch.uint8)
-    return levels.unflatten(0, (-1, 3)).transpose(1, 2).contiguous().view(image.shape)
+    return levels.view(len(image), 3, -1).transpose(1, 2).contiguous().view(image.shape)

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from graspq.common.files import committed
 from graspq.studies.study.comparisons import Place, Scored
@@ -39,36 +40,43 @@ def write_figures(study: str, rows: Rows, runs: Trainings, references: Reference
 
 
 def bars(rows: Rows, references: References) -> Figure:
-    """Return the bars: a panel a task, a group for each size and setting, a bar for each row, a dot for each run."""
+    """Return the bars: a panel a task, a group for each size and setting, a bar for each row, a dot for each run.
+
+    They lie, so that names can be read however many there are; rows of one estimator have one colour.
+    """
     tasks = list(dict.fromkeys(place.task for place in rows))
-    names = list(dict.fromkeys(name for here in rows.values() for name in here))
-    count = max(sum(len(here) + 1 for place, here in rows.items() if place.task == task) for task in tasks)
-    figure = Figure(figsize=(max(4.5, 1.2 + 0.62 * count), 3.4 * len(tasks)), layout="constrained")
-    for axes, task in zip(np.atleast_1d(figure.subplots(len(tasks), 1)), tasks, strict=True):
+    algos = list(dict.fromkeys(row.algo for here in rows.values() for row in here.values()))
+    counts = [sum(len(here) + 1 for place, here in rows.items() if place.task == task) for task in tasks]
+    figure = Figure(figsize=(7.2, sum(0.9 + 0.23 * count for count in counts)), layout="constrained")
+    panels = figure.subplots(len(tasks), 1, height_ratios=counts)
+    for axes, task in zip(np.atleast_1d(panels), tasks, strict=True):
         place_of, ticks, labels = 0.0, list[float](), list[str]()
         for place, here in rows.items():
             if place.task != task:
                 continue
             for row in here.values():
-                color = COLORS[names.index(row.name) % len(COLORS)]
+                color = COLORS[algos.index(row.algo) % len(COLORS)]
                 mean = row.mean
                 error = [[max(mean.value - mean.low, 0.0)], [max(mean.high - mean.value, 0.0)]]
-                axes.bar(place_of, mean.value, 0.78, color=color, alpha=0.85)
-                axes.errorbar(place_of, mean.value, yerr=error, color=INK, capsize=3, linewidth=1.1)
+                axes.barh(place_of, mean.value, 0.78, color=color, alpha=0.85)
+                axes.errorbar(mean.value, place_of, xerr=error, color=INK, capsize=2.5, linewidth=1.1)
                 spread = np.linspace(-0.2, 0.2, len(row.rates)) if len(row.rates) > 1 else [0.0]
-                axes.plot(place_of + np.asarray(spread), row.rates, ".", color=INK, markersize=3.5, alpha=0.6)
+                axes.plot(row.rates, place_of + np.asarray(spread), ".", color=INK, markersize=3.5, alpha=0.6)
                 ticks.append(place_of)
-                labels.append(row.name if _alone(rows, task) else f"{row.name}\n{place.size}{_setting(place)}")
+                labels.append(row.name if _alone(rows, task) else f"{row.name}, {place.size}{_setting(place)}")
                 place_of += 1
             place_of += 0.6
         for one in references.get(task, []):
-            axes.axhline(one["success_rate"], color=PALE, linewidth=0.9, linestyle=":")
+            axes.axvline(one["success_rate"], color=PALE, linewidth=0.9, linestyle=":")
             axes.annotate(
-                one["policy"], (1.0, one["success_rate"]), xycoords=("axes fraction", "data"), size=7, color=PALE
-            )
-        axes.set_xticks(ticks, labels, rotation=30, ha="right", size=8)
+                one["policy"], (one["success_rate"], 0.0), xycoords=("data", "axes fraction"), size=7, color=PALE,
+                xytext=(2, 2), textcoords="offset points",
+            )  # fmt: skip
+        axes.set_yticks(ticks, labels)
+        axes.set_ylim(place_of - 0.6, -0.8)  # the first row on top
         split = next(place.split for place in rows if place.task == task)
-        _frame(axes, f"{task.capitalize()} task, {split} split: mean success of training seeds, 95 % intervals")
+        _frame(axes, f"{task.capitalize()} task, {split} split", "x")
+        axes.set_xlabel("mean success of training seeds, with 95 % intervals")
     return figure
 
 
@@ -80,11 +88,12 @@ def _setting(place: Place) -> str:
     return "" if place.setting == "off-policy" else f", {place.setting}"
 
 
-def _frame(axes: Axes, title: str) -> None:
-    axes.set_ylim(0, 1)
-    axes.set_ylabel("success", size=8, color=INK)
+def _frame(axes: Axes, title: str, along: Literal["x", "y"] = "y") -> None:
+    axes.set(**{f"{along}lim": (0, 1)})
+    axes.set(**{f"{along}label": "success"})
+    getattr(axes, f"{along}axis").label.set(size=8, color=INK)
     axes.set_title(title, size=9, loc="left", color=INK)
-    axes.grid(axis="y", color="#e5e7eb", linewidth=0.7)
+    axes.grid(axis=along, color="#e5e7eb", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, colors=INK)
     for side in ("top", "right"):
@@ -141,12 +150,14 @@ def sorted_settings(runs: Trainings) -> Figure | None:
     (here,) = runs.values() if len(runs) == 1 else ({},)
     if len(here) < 2 or max(len({name for name, _ in some}) for some in here.values()) < 3:
         return None
-    figure = Figure(figsize=(5.2, 3.4), layout="constrained")
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     for index, (algo, some) in enumerate(here.items()):
         ranked = sorted((rate for _, rate in some), reverse=True)
-        axes.plot(range(1, len(ranked) + 1), ranked, "o-", markersize=3, color=COLORS[index % len(COLORS)], label=algo)
+        style = "o-" if index < len(COLORS) else "s--"
+        axes.plot(range(1, len(ranked) + 1), ranked, style, markersize=3, color=COLORS[index % len(COLORS)], label=algo)
     axes.set_xlabel("rank of the training within its estimator; one that failed stands at 0", size=8, color=INK)
-    axes.legend(fontsize=7, frameon=False)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     _frame(axes, "Success of every training, sorted")
     return figure
