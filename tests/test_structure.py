@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 
 from graspq.common.options import flag, shown_value
+from graspq.common.text import markdown
+from graspq.evaluate.statistics import wilson_interval
+from graspq.studies.study.comparisons import scored_rows
+from graspq.studies.study.scores import read_scores
 from graspq.train.estimators import ESTIMATORS, as_markdown
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -127,6 +131,27 @@ def test_the_readmes_table_of_estimators_is_the_code():
     assert readme[start : readme.index("<!-- end of estimators -->")] == as_markdown()
 
 
+def test_the_readmes_table_of_success_is_that_of_the_published_study():
+    readme = (ROOT / "README.md").read_text()
+    start = readme.index("\n", readme.index("<!-- study 10k:")) + 1
+    shown = readme[start : readme.index("<!-- end of study 10k -->")]
+    assert shown == reached(read_scores([ROOT / "results/study-10k.jsonl"]))
+
+
+def reached(table):
+    [rows] = scored_rows(table).values()
+    lines = []
+    for row in sorted(rows.values(), key=lambda one: -one.mean.value):
+        minutes = sum(one["training_seconds"] for one in row.rows) / len(row.rows) / 60
+        low, high = row.mean.low, row.mean.high
+        rates = " ".join(f"{rate:.3f}" for rate in row.rates)
+        lines.append([f"`{row.name}`", f"{row.mean.value:.3f}", f"{low:.3f} to {high:.3f}", rates, f"{minutes:.1f}"])
+    for one in (one for one in table if one["kind"] == "reference"):
+        low, high = wilson_interval(one["successes"], one["episodes"])
+        lines.append([one["policy"], f"{one['success_rate']:.3f}", f"{low:.3f} to {high:.3f}", "", ""])
+    return markdown(["estimator", "success", "95 % interval", "each seed", "minutes of a training"], lines)
+
+
 @pytest.mark.parametrize(
     "page", ["README.md", "RESULTS.md", *(f"docs/{one.name}" for one in (ROOT / "docs").glob("*.md"))]
 )
@@ -135,8 +160,19 @@ def test_files_that_a_page_names_exist(page):
 
 
 def links_without_a_file(page):
-    links = re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text())
-    return [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()) if "://" not in link]
+    return [link for link in links if not found(page, *link.partition("#")[::2])]
+
+
+def found(page, name, anchor):
+    path = page.parent / name if name else page
+    return path.exists() and (not anchor or anchor in anchors(path))
+
+
+def anchors(page):
+    """Return what the headings of a page are called in links."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def test_the_index_of_the_estimators_pages_holds_the_readmes_table():

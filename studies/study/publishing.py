@@ -159,15 +159,15 @@ def row_table(rows: Rows, table: Table, reference: str | None = None) -> str:
         "p (Holm)",
     ]
     text = markdown([*heads, "discount", "steps", "recipe"], lines)
-    missing = [
+    failed = [
         f"`{row.name}` ({place}): {row.lacking}" + "".join(f"; {one}" for one in row.failures)
         for place, here in asked_rows(table).items()
         for row in here.values()
-        if row.lacking
+        if row.failures
     ]
     begun = {row for here in asked_rows(table).values() for row in here}
     unbegun = sorted({one["row"] for one in table if one["kind"] == "run"} - begun)
-    text += "\nNot whole: " + ". ".join(missing) + ".\n" if missing else ""
+    text += "\nFailed: " + ". ".join(failed) + ".\n" if failed else ""
     return text + ("\nNot run: " + ", ".join(f"`{name}`" for name in unbegun) + ".\n" if unbegun else "")
 
 
