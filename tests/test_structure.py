@@ -12,8 +12,8 @@ import pytest
 
 from graspq.common.options import flag, shown_value
 from graspq.common.text import markdown
-from graspq.evaluate.statistics import wilson_interval
 from graspq.studies.study.comparisons import scored_rows
+from graspq.studies.study.publishing import row_table
 from graspq.studies.study.scores import read_scores
 from graspq.train.estimators import ESTIMATORS, as_markdown
 
@@ -139,16 +139,15 @@ def test_the_readmes_table_of_success_is_that_of_the_published_study():
 
 
 def reached(table):
-    [rows] = scored_rows(table).values()
+    """Return columns of the table in RESULTS.md, and how long a training took."""
+    [(place, rows)] = scored_rows(table).items()
+    seconds = {f"`{row.name}`": [one["training_seconds"] for one in row.rows] for row in rows.values()}
     lines = []
-    for row in sorted(rows.values(), key=lambda one: -one.mean.value):
-        minutes = sum(one["training_seconds"] for one in row.rows) / len(row.rows) / 60
-        low, high = row.mean.low, row.mean.high
-        rates = " ".join(f"{rate:.3f}" for rate in row.rates)
-        lines.append([f"`{row.name}`", f"{row.mean.value:.3f}", f"{low:.3f} to {high:.3f}", rates, f"{minutes:.1f}"])
-    for one in (one for one in table if one["kind"] == "reference"):
-        low, high = wilson_interval(one["successes"], one["episodes"])
-        lines.append([one["policy"], f"{one['success_rate']:.3f}", f"{low:.3f} to {high:.3f}", "", ""])
+    for line in re.findall(r"^\| (.+) \|$", row_table({place: rows}, table), re.MULTILINE)[1:]:
+        name, _, _, success, interval, rates, *_ = line.split(" | ")
+        name = name.partition(" (")[0]  # how many trainings are done the rates tell
+        here = seconds.get(name, [])
+        lines.append([name, success, interval, rates, f"{sum(here) / len(here) / 60:.1f}" if here else ""])
     return markdown(["estimator", "success", "95 % interval", "each seed", "minutes of a training"], lines)
 
 

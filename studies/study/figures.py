@@ -75,8 +75,8 @@ def bars(rows: Rows, references: References) -> Figure:
         axes.set_yticks(ticks, labels)
         axes.set_ylim(place_of - 0.6, -0.8)  # the first row on top
         split = next(place.split for place in rows if place.task == task)
-        _frame(axes, f"{task.capitalize()} task, {split} split", "x")
-        axes.set_xlabel("mean success of training seeds, with 95 % intervals")
+        label = "mean success of training seeds, with 95 % intervals"
+        _frame(axes, f"{task.capitalize()} task, {split} split", "x", label)
     return figure
 
 
@@ -88,9 +88,8 @@ def _setting(place: Place) -> str:
     return "" if place.setting == "off-policy" else f", {place.setting}"
 
 
-def _frame(axes: Axes, title: str, along: Literal["x", "y"] = "y") -> None:
-    axes.set(**{f"{along}lim": (0, 1)})
-    axes.set(**{f"{along}label": "success"})
+def _frame(axes: Axes, title: str, along: Literal["x", "y"] = "y", label: str = "success") -> None:
+    axes.set(**{f"{along}lim": (0, 1), f"{along}label": label})
     getattr(axes, f"{along}axis").label.set(size=8, color=INK)
     axes.set_title(title, size=9, loc="left", color=INK)
     axes.grid(axis=along, color="#e5e7eb", linewidth=0.7)

@@ -157,7 +157,7 @@ def _wrong(what: str, ran: Ran) -> Tried | None:
     broken = ran.broken()
     if broken is not None:
         return broken
-    killed = "killed" in what and "server" not in what and ran.rc == -signal.SIGKILL
+    killed = what.startswith(("the command killed", "all killed")) and ran.rc == -signal.SIGKILL
     if ran.rc in (0, 1, 130) or killed or one_line(ran):
         return None
     return Tried("lost", f"exit status {ran.rc}: {ran.line}")
