@@ -93,7 +93,7 @@ def cross_entropy(output: Tensor, target: Tensor) -> Tensor:
     """Return -y log Q - (1 - y) log(1 - Q) with Q = 1 / (1 + exp(-output)), for targets y in [0, 1]; float [n].
 
     Its minimum over Q is the mean of y, as that of the squared error is.
-    Differs: the paper regresses with `squared`. Returns are probabilities of success here, for which this is the
+    Differs: the paper regresses with `squared`, its code with `huber`. Returns are probabilities of success here, for which this is the
     likelihood; it does not lose its gradient where Q is sure and wrong.
     """
     return functional.binary_cross_entropy_with_logits(output, target, reduction="none")
@@ -102,20 +102,31 @@ def cross_entropy(output: Tensor, target: Tensor) -> Tensor:
 def squared(output: Tensor, target: Tensor) -> Tensor:
     """Return ½ (Q - y)² with Q = output; float [n].
 
-    Source: Quillen et al. 2018, section "Off-Policy Q-Learning". The released code's Huber loss with δ = 1 is the same
-    where |Q - y| ≤ 1.
+    Source: Quillen et al. 2018, section "Off-Policy Q-Learning".
     """
     return 0.5 * (output - target) ** 2
 
 
-LOSSES = {"cross-entropy": Loss("logistic", cross_entropy), "squared": Loss("identity", squared)}
+def huber(output: Tensor, target: Tensor) -> Tensor:
+    """Return ½ (Q - y)² where |Q - y| ≤ 1, else |Q - y| - ½, with Q = output; float [n].
+
+    Source: the released code of Quillen et al. 2018; their text has `squared`.
+    """
+    return functional.huber_loss(output, target, reduction="none")
+
+
+LOSSES = {
+    "cross-entropy": Loss("logistic", cross_entropy),
+    "squared": Loss("identity", squared),
+    "huber": Loss("identity", huber),
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class RegressionSettings(EstimatorSettings):
     """Options of every estimator that is a regression of Q."""
 
-    loss: Literal["cross-entropy", "squared"] = setting("cross-entropy", help="Loss between Q and target.")
+    loss: Literal["cross-entropy", "squared", "huber"] = setting("cross-entropy", help="Loss between Q and target.")
 
 
 @dataclasses.dataclass(frozen=True)

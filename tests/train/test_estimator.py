@@ -15,7 +15,7 @@ from graspq.common.errors import UserError
 from graspq.datasets.dataset import open_shards
 from graspq.train.batch import Batch
 from graspq.train.batches import training_batches
-from graspq.train.estimator import cross_entropy, squared
+from graspq.train.estimator import cross_entropy, huber, squared
 from graspq.train.estimators import ESTIMATORS, as_markdown, dql, estimator_named, mc
 from graspq.train.loop import update
 from graspq.train.networks.network import Features, QNetwork
@@ -132,7 +132,7 @@ def test_discounts_are_the_rows_own_the_datasets_or_those_given() -> None:
     assert ESTIMATORS["supervised"].settings().chosen_discount(0.95) == 1.0
 
 
-@pytest.mark.parametrize("loss", [cross_entropy, squared])
+@pytest.mark.parametrize("loss", [cross_entropy, squared, huber])
 def test_the_best_constant_for_a_loss_is_the_mean_of_the_targets(loss: object) -> None:
     targets = torch.tensor([0.0, 0.0, 1.0, 0.6], dtype=torch.float64)
     outputs = torch.linspace(-3, 3, 60_001, dtype=torch.float64).unsqueeze(1)
@@ -144,6 +144,12 @@ def test_the_best_constant_for_a_loss_is_the_mean_of_the_targets(loss: object) -
 
 def test_the_squared_loss_is_half_the_squared_error() -> None:
     assert squared(torch.tensor([3.0]), torch.tensor([1.0])).item() == 2.0
+
+
+def test_the_huber_loss_is_the_squared_one_up_to_an_error_of_one_and_then_grows_by_the_error() -> None:
+    errors = torch.tensor([-3.0, -1.0, -0.5, 0.0, 0.8, 1.0, 2.0])
+    expected = torch.tensor([2.5, 0.5, 0.125, 0.0, 0.32, 0.5, 1.5])
+    torch.testing.assert_close(huber(errors + 0.25, torch.full((7,), 0.25)), expected)
 
 
 PICKED_AND_JUDGED = ["lagged-q by running", "q by batch", "q by running"]

@@ -27,10 +27,10 @@ COMMON = {
     "steps": 2_000_000,  # C: env_procedural
     "precision": "float32",
 }
-SQUARED: dict[str, Any] = {"loss": "squared"}  # P, equations
-DOUBLE_Q = SQUARED | {"discount": 0.9, "lag_steps": 50}  # P: every 50 gradient updates
+HUBER: dict[str, Any] = {"loss": "huber"}  # C; P, equations: squared
+DOUBLE_Q = HUBER | {"discount": 0.9, "lag_steps": 50}  # P: every 50 gradient updates
 # C: V by double Q over 16 actions; no clamp, no centring.
-CORRECTED = SQUARED | {
+CORRECTED = HUBER | {
     "discount": 0.9,
     "candidates": 16,
     "clamped": False,
@@ -38,18 +38,18 @@ CORRECTED = SQUARED | {
     "look_in_mirror": False,
 }
 OWN: dict[str, dict[str, Any]] = {
-    "supervised": SQUARED | {"use_pose": False},
+    "supervised": HUBER | {"use_pose": False},
     "dql": DOUBLE_Q | {"candidates": 16},  # P: 16 actions uniformly at random
-    "mc": SQUARED | {"discount": None},  # P, footnote; C
+    "mc": HUBER | {"discount": None},  # P, footnote; C
     # C: 100,000 of 2 million steps; the advantage's Q is the trained network's, gradient and all; 32 episodes.
     "corr-mc": CORRECTED | {"lag_steps": 100, "anneal": 0.05, "judge": "online-gradient", "batch_of": "episodes"},
     "ddpg": DOUBLE_Q | {"actor_rest": 0.0, "actor_rate": 1.0, "actor_every": 1},
-    # Not the paper's: the squared error, and else their defaults.
+    # Not the paper's: the loss of the code they were published with, and else their defaults.
     "nstep": DOUBLE_Q | {"candidates": 16, "n": 2},
     "td-lambda": DOUBLE_Q | {"candidates": 16, "trace_decay": 0.5},
     "mc-floor": DOUBLE_Q | {"discount": 0.8, "candidates": 16},
-    "iql": DOUBLE_Q | {"expectile": 0.9, "policy": "search", "sharpness": 10.0},
-    "td3-bc": DOUBLE_Q | {"alpha": 2.5, "smoothing": 0.2, "smoothing_bound": 0.5, "actor_every": 2},
+    "iql": DOUBLE_Q | {"loss": "squared", "expectile": 0.9, "policy": "search", "sharpness": 10.0},
+    "td3-bc": DOUBLE_Q | {"loss": "squared", "alpha": 2.5, "smoothing": 0.2, "smoothing_bound": 0.5, "actor_every": 2},
     # Configuration of the authors' Trust-PCL for grasping.
     "pcl": {
         "discount": 0.95,

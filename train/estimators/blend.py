@@ -138,7 +138,7 @@ row = Estimator(
         needs_return=False,
     ),
     action_selection=StochasticSearch(),
-    paper=BlendSettings(loss="squared"),
+    paper=BlendSettings(loss="huber"),
     update=measured_regression,
     kept=nothing_measured,
 )

@@ -35,9 +35,9 @@ class CorrMcSettings(CorrectionSettings, EpisodeSettings):
             UserError: a value is out of range, or the gradient of a loss is asked for that has no use for it.
         """
         super().__post_init__()
-        if self.judge == "online-gradient" and self.loss != "squared":
+        if self.judge == "online-gradient" and self.loss == "cross-entropy":
             # The slope of the cross-entropy in its target does not vanish where the target is met.
-            raise UserError(f"--judge online-gradient: expected --loss squared, got --loss {self.loss}")
+            raise UserError("--judge online-gradient: expected --loss squared or huber, got --loss cross-entropy")
 
 
 def target(
@@ -108,7 +108,7 @@ row = Estimator(
     ),
     action_selection=StochasticSearch(),
     paper=CorrMcSettings(
-        loss="squared", discount=0.9, lag_steps=100, anneal=0.05, judge="online-gradient", batch_of="episodes"
+        loss="huber", discount=0.9, lag_steps=100, anneal=0.05, judge="online-gradient", batch_of="episodes"
     ),
     recipe=dataclasses.replace(DEFAULT, learning_rate=1e-3),
     paper_recipe=dataclasses.replace(PAPER, learning_rate=1e-4),

@@ -113,7 +113,7 @@ row = Estimator(
     settings=DdpgSettings,
     target_value=TargetValue("bootstrapped", target, needs_next=True, needs_return=False),
     action_selection=ActorNetwork(),
-    paper=DdpgSettings(loss="squared", actor_rest=0.0, actor_rate=1.0, actor_every=1),
+    paper=DdpgSettings(loss="huber", actor_rest=0.0, actor_rate=1.0, actor_every=1),
     parts={"q": q_network, "actor": state_network(lambda specification: specification.actions)},
     update=actor_critic,
 )

@@ -46,5 +46,5 @@ row = Estimator(
         "bootstrapped (double Q, lagged target network)", target, needs_next=True, needs_return=False
     ),
     action_selection=StochasticSearch(),
-    paper=DqlSettings(loss="squared"),
+    paper=DqlSettings(loss="huber"),
 )

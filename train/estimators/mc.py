@@ -48,5 +48,5 @@ row = Estimator(
     settings=McSettings,
     target_value=TargetValue("episode value", target),
     action_selection=StochasticSearch(),
-    paper=McSettings(loss="squared"),
+    paper=McSettings(loss="huber"),
 )

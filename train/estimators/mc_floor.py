@@ -41,5 +41,5 @@ row = Estimator(
     settings=McFloorSettings,
     target_value=TargetValue("larger of bootstrapped and episode value", target, needs_next=True),
     action_selection=StochasticSearch(),
-    paper=McFloorSettings(loss="squared"),
+    paper=McFloorSettings(loss="huber"),
 )

@@ -46,5 +46,5 @@ row = Estimator(
     settings=NstepSettings,
     target_value=TargetValue("bootstrapped after n steps (double Q)", target, view="episodes", needs_return=False),
     action_selection=StochasticSearch(),
-    paper=NstepSettings(loss="squared"),
+    paper=NstepSettings(loss="huber"),
 )

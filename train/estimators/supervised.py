@@ -138,7 +138,7 @@ row = Estimator(
     settings=SupervisedSettings,
     target_value=TargetValue("episode value, on synthetic actions", mc.target),
     action_selection=SearchOfMotions(),
-    paper=SupervisedSettings(loss="squared"),
+    paper=SupervisedSettings(loss="huber"),
     regressed_action=synthetic_action,
     kept=measured_motions,
 )

@@ -44,5 +44,5 @@ row = Estimator(
     settings=TdLambdaSettings,
     target_value=TargetValue("lambda-return (double Q)", target, view="episodes", needs_return=False),
     action_selection=StochasticSearch(),
-    paper=TdLambdaSettings(loss="squared"),
+    paper=TdLambdaSettings(loss="huber"),
 )

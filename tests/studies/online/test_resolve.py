@@ -60,7 +60,7 @@ def test_from_scratch_the_preset_decides_all_but_the_schedule(base: Path) -> Non
     assert plan.start is None and plan.train.steps == 20 and plan.border(0) == 0
     assert (plan.train.schedule, plan.train.learning_rate, plan.train.batch_size) == ("constant", 2e-3, 256)
     paper = resolve({"algo": "mc", "shards": (str(base),), "preset": "paper"})
-    assert (paper.train.learning_rate, paper.train.batch_size, paper.train.own.loss) == (1e-3, 32, "squared")
+    assert (paper.train.learning_rate, paper.train.batch_size, paper.train.own.loss) == (1e-3, 32, "huber")
     assert str(paper.train.run_folder) == "runs/online-mc-base-seed0"
 
 
@@ -75,7 +75,7 @@ def test_an_earlier_checkpoint_can_be_the_start(make_plan: Make, tmp_path: Path)
     [
         ({"algo": "mc"}, r"--algo: .* was trained with dql, got mc; leave the option out"),
         ({"width": 16}, r"--width: .* was trained with 8, got 16"),
-        ({"loss": "cross-entropy"}, r"--loss: .* was trained with squared, got cross-entropy"),
+        ({"loss": "cross-entropy"}, r"--loss: .* was trained with huber, got cross-entropy"),
         ({"preset": "paper"}, r"--preset: .* has its settings already"),
         ({"anneal": 0.5}, r"--anneal belongs to --algo corr-mc; it is no option of --algo dql"),
         ({"network": "default"}, r"--network: .* was trained with paper, got default"),
