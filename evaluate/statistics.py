@@ -144,7 +144,7 @@ def mean_success(success: Outcomes, counts: Floats | None = None, confidence: fl
     with s² the sample variance (of the runs' means, of the scenes' means) and σ̂² = Σ (y_is - ȳ_i. - ȳ_.s + ȳ)² /
     ((S - 1) (N - 1)); σ̂² is taken away once since both variances hold it. The interval is ȳ ± t(ν) √Var, clipped to
     [0, 1], with ν = Var² / (Σ part² / its freedom) (Welch & Satterthwaite), the parts being s²(ȳ_i.) / S with S - 1 and
-    s²(ȳ_.s) / N with N - 1. Where nothing varies it is Wilson's of one run.
+    s²(ȳ_.s) / N with N - 1, and ν no less than the least of these. Where nothing varies it is Wilson's of one run.
 
     Args:
         success: outcome of each run in each scene, bool [S, N]. One run has no variance between runs: then the interval
@@ -223,7 +223,10 @@ def _estimate(
         error = (high - low) / (2 * NormalDist().inv_cdf(0.5 + confidence / 2))
         return SeveralRuns(value, low, high, error, scenes - 1.0, scenes)
     error = math.sqrt(variance)
-    freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
+    # The parts hold what was taken away from the variance: where little is left, the formula falls below all of theirs.
+    freedom = max(
+        variance**2 / sum(part**2 / degrees for part, degrees in parts), min(float(degrees) for _, degrees in parts)
+    )
     half = float(scipy.stats.t.ppf(0.5 + confidence / 2, freedom)) * error
     return SeveralRuns(value, max(least, value - half), min(1.0, value + half), error, freedom, scenes)
 

@@ -93,8 +93,8 @@ def cross_entropy(output: Tensor, target: Tensor) -> Tensor:
     """Return -y log Q - (1 - y) log(1 - Q) with Q = 1 / (1 + exp(-output)), for targets y in [0, 1]; float [n].
 
     Its minimum over Q is the mean of y, as that of the squared error is.
-    Differs: the paper regresses with `squared`, its code with `huber`. Returns are probabilities of success here, for which this is the
-    likelihood; it does not lose its gradient where Q is sure and wrong.
+    Differs: the paper regresses with `squared`, its code with `huber`. Returns are probabilities of success here, for
+    which this is the likelihood; it does not lose its gradient where Q is sure and wrong.
     """
     return functional.binary_cross_entropy_with_logits(output, target, reduction="none")
 

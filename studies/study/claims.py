@@ -1,6 +1,8 @@
 """The claims of the paper, one by one, against the scores of studies: each holds, fails, is not decided or not tested.
 
-Each names its test; margins and levels are fixed here, before any score is seen. Source: Quillen et al. 2018.
+Each names its test; margins and levels are fixed here. They were written before version 2's `test` objects were opened,
+and made stricter when one of five seeds of the study at 10k was known: all rows that a claim speaks of must be there,
+and intervals are widened where one of many decides. Source: Quillen et al. 2018.
 """
 
 import itertools
@@ -13,7 +15,15 @@ from typing import Any, Literal
 import scipy
 
 from graspq.common.options import parse_count
-from graspq.studies.study.comparisons import Compared, Place, Scored, asked_rows, compare, trainings
+from graspq.studies.study.comparisons import (
+    Compared,
+    Place,
+    Scored,
+    asked_rows,
+    compare,
+    trainings,
+    widened_confidence,
+)
 
 Verdict = Literal["holds", "fails", "not decided", "not tested"]
 Rows = Mapping[Place, Mapping[str, Scored]]
@@ -22,7 +32,8 @@ SIX = (*SEARCH, *ACTOR)
 SLIGHT = 0.05  # success rates that differ by less are "slightly" different, or "competitive"
 DISASTROUS = 0.10
 LEAST_FRESH = 0.10  # of all grasps, from which on data are called on-policy
-FEWEST_POINTS = 6  # of a sweep, from which on stability can be spoken of
+FEWEST_TRAININGS, FEWEST_SETTINGS = 6, 3  # from which on stability can be spoken of
+MUCH_DATA = 1_000_000  # grasps, the most that the paper has
 
 
 @dataclass(frozen=True)
@@ -47,8 +58,8 @@ def judged(table: Sequence[Mapping[str, Any]]) -> list[Judged]:
 
     Args:
         table: scores of any number of studies; a row counts by its name, so that `mc` is the `mc` of the recipe and not
-            one of its variants. A claim whose rows lack a run, as one diverged, is not tested: those that are left are
-            not a chance sample.
+            one of its variants. A claim is not tested where a row that it speaks of is not there, lacks a run, as one
+            diverged (those that are left are not a chance sample), or has one run alone.
 
     Raises:
         UserError: rows of one name or place are not those of one recipe and the same scenes, see `asked_rows`.
@@ -63,7 +74,7 @@ def dql_best_in_low_data(rows: Rows) -> Judged:
         "DQL performs better than the others that learn values in low-data regimes",
         "`dql` against `mc`, `corr-mc`, `ddpg`, `pcl` at 10k, off-policy, on every task that was run (the paper has "
         "supervised learning do best there too); Holm, 5 %",
-        _where(rows, ("dql",), size=10_000),
+        _where(rows, size=10_000),
         ("dql",),
         ("mc", "corr-mc", "ddpg", "pcl"),
     )
@@ -74,7 +85,7 @@ def mc_best_at_1m(rows: Rows) -> Judged:
     return _best_of(
         "MC and Corr-MC are slightly better with much data on the targeted task",
         "`mc` and `corr-mc` each against `dql`, `supervised`, `ddpg` and `pcl` at 1M, targeted; Holm, 5 %",
-        _where(rows, ("mc", "corr-mc"), size=1_000_000, task="targeted"),
+        _where(rows, size=MUCH_DATA, task="targeted"),
         ("mc", "corr-mc"),
         ("dql", "supervised", "ddpg", "pcl"),
     )
@@ -84,8 +95,8 @@ def bias_of_mc(rows: Rows) -> Judged:
     """Judge: MC is a strong baseline although its target is biased off-policy."""
     return _within(
         "The bias of MC off-policy is not disastrous",
-        f"`mc`, and `mc-discount0.9` where it was run, less the better of `dql` and `corr-mc`: interval above "
-        f"−{DISASTROUS:.2f} everywhere (below: fails)",
+        f"`mc`, and `mc-discount0.9` where it was run, less `dql` and less `corr-mc`: every interval above "
+        f"−{DISASTROUS:.2f} (one that is widened for their number below: fails)",
         _where(rows, ("mc", "dql", "corr-mc")),
         ("mc", "mc-discount0.9"),
         ("dql", "corr-mc"),
@@ -97,7 +108,8 @@ def supervised_competitive(rows: Rows) -> Judged:
     """Judge: supervised learning is among the most successful given enough data."""
     return _within(
         "Supervised learning is competitive",
-        f"`supervised` less the best of `dql`, `mc`, `corr-mc`: the whole interval above −{SLIGHT:.2f} everywhere",
+        f"`supervised` less `dql`, less `mc` and less `corr-mc`: every interval above −{SLIGHT:.2f} (one that is "
+        "widened for their number below: fails)",
         _where(rows, ("supervised", "dql", "mc", "corr-mc")),
         ("supervised",),
         ("dql", "mc", "corr-mc"),
@@ -109,14 +121,19 @@ def on_policy_slight(rows: Rows) -> Judged:
     """Judge: on-policy data make a slight difference."""
     claim = "Off- and on-policy differ slightly, for all estimators"
     test = (
-        "each row on-policy less off-policy at the same task, size and scenes, fresh grasps at least "
-        f"{LEAST_FRESH:.0%} of the data: every interval within ±{SLIGHT:.2f}"
+        "each of the six on-policy less off-policy at the same task, size and scenes, fresh grasps at least "
+        f"{LEAST_FRESH:.0%} of the data: every interval within ±{SLIGHT:.2f} (one that is widened for their number "
+        "outside: fails)"
     )
-    pairs = []
-    for place, here in rows.items():
-        there = rows.get(Place(place.task, place.size, "off-policy", place.split), {})
-        if place.setting == "on-policy" and place.split.startswith("test"):
-            pairs += [(here[name], there[name]) for name in SIX if name in here and name in there]
+    both = {
+        place: (here, rows.get(Place(place.task, place.size, "off-policy", place.split), {}))
+        for place, here in rows.items()
+        if place.setting == "on-policy" and place.split.startswith("test")
+    }
+    unready = "; ".join(filter(None, (_unready({place: one}, SIX) for place, way in both.items() for one in way)))
+    if unready:
+        return Judged(claim, test, "not tested", unready)
+    pairs = [(here[name], there[name]) for here, there in both.values() for name in SIX]
     shares = [share for row, _ in pairs for share in _fresh_shares(row)]
     if shares and min(shares) < LEAST_FRESH:
         return Judged(claim, test, "not tested", f"of the data, {min(shares):.1%} are fresh grasps")
@@ -135,26 +152,31 @@ def actor_worse(rows: Rows) -> Judged:
     test = (
         "`ddpg` and `pcl` each against `dql`, `mc`, `corr-mc`, `supervised`; Holm, 5 %: all worse (any better: fails)"
     )
-    families = [
-        list(itertools.product(_named(here, ACTOR), _named(here, SEARCH))) for here in _where(rows, ("ddpg",)).values()
-    ]
-    return _judged(
-        claim, test, families, _all_worse, "no row with an actor stands beside one that searches", told=_not_worse
-    )
+    places = _where(rows)
+    unready = _unready(places, SIX)
+    if unready:
+        return Judged(claim, test, "not tested", unready)
+    families = [list(itertools.product(_named(here, ACTOR), _named(here, SEARCH))) for here in places.values()]
+    missing = "no row with an actor stands beside one that searches"
+    return _judged(claim, test, families, _all_worse, missing, told=_not_worse)
 
 
 def actor_unstable(found: Mapping[Place, Mapping[str, Sequence[tuple[str, float]]]]) -> Judged:
     """Judge: methods with an actor network, of which DDPG is tested, are unstable over hyperparameters."""
     claim = "An actor network, here DDPG's, makes training unstable over hyperparameters and seeds"
     test = (
-        f"at least {FEWEST_POINTS} trainings of `ddpg` and of a row that searches, over settings and seeds: on any "
-        "split: shortfalls (best rate less each) are larger with the actor, Mann-Whitney, one-sided, 5 %"
+        f"at least {FEWEST_TRAININGS} trainings of `ddpg`, and as many of each row that searches, over "
+        f"{FEWEST_SETTINGS} settings or more, on any split: shortfalls (best rate less each) are larger with the "
+        "actor, Mann-Whitney, one-sided, 5 %"
     )
+    judged_at: list[tuple[int, Judged]] = []
     for place, here in found.items():
+        # As many of each: the best of more trainings is better, and all fall shorter of it.
+        count = max(len(here.get(ACTOR[0], ())), FEWEST_TRAININGS)
         swept = {
             algo: [rate for _, rate in some]
             for algo, some in here.items()
-            if len({name for name, _ in some}) > 1 and len(some) >= FEWEST_POINTS
+            if len({name for name, _ in some}) >= FEWEST_SETTINGS and len(some) == count
         }
         actor, search = (
             [max(rates) - rate for algo, rates in swept.items() if algo in group for rate in rates]
@@ -163,31 +185,40 @@ def actor_unstable(found: Mapping[Place, Mapping[str, Sequence[tuple[str, float]
         if actor and search:
             p = float(scipy.stats.mannwhitneyu(actor, search, alternative="greater").pvalue)
             lower = float(scipy.stats.mannwhitneyu(actor, search, alternative="less").pvalue)
+            verdict: Verdict = "holds" if p < 0.05 else "fails" if lower < 0.05 else "not decided"
             seen = (
                 f"{place}: median shortfall {statistics.median(actor):.3f} of {len(actor)} with the actor, "
                 f"{statistics.median(search):.3f} of {len(search)} that search; p {p:.3f}"
             )
-            return Judged(claim, test, "holds" if p < 0.05 else "fails" if lower < 0.05 else "not decided", seen)
-    return Judged(claim, test, "not tested", "no study here varies the settings of both")
+            judged_at.append((len(actor) + len(search), Judged(claim, test, verdict, seen)))
+    missing = f"no study here has {FEWEST_TRAININGS} trainings of either over {FEWEST_SETTINGS} settings"
+    return max(judged_at, key=lambda one: one[0])[1] if judged_at else Judged(claim, test, "not tested", missing)
 
 
 def ninety_percent(rows: Rows) -> Judged:
     """Judge: unseen objects are grasped with 90 % success."""
     claim = "Previously unseen objects are grasped with an average success rate of 90 %"
     test = (
-        "regular task, test split, the best of the six by this same score, which flatters it: interval of its mean, "
-        "new seeds, scenes and objects: ≥ 0.90"
+        "regular task, test split: interval of a mean of one of the six, new seeds, scenes and objects, widened for "
+        f"their number: ≥ 0.90 (all six below with the paper's {MUCH_DATA:,} grasps: fails)"
     )
-    scored = [(place, one) for place, here in _where(rows, (), task="regular").items() for one in _named(here, SIX)]
+    places = _where(rows, task="regular")
+    scored = [(place, one) for place, here in places.items() for one in _named(here, SIX)]
     if not scored:
         return Judged(claim, test, "not tested", "no score on the test split")
-    lacking = _lacking([row for _, row in scored])
-    if lacking:
-        return Judged(claim, test, "not tested", lacking)
+    unready = _unready_rows([row for _, row in scored])
+    if unready:
+        return Judged(claim, test, "not tested", unready)
     place, row = max(scored, key=lambda one: one[1].mean.value)
-    verdict: Verdict = "holds" if row.mean.low >= 0.9 else "fails" if row.mean.high < 0.9 else "not decided"
-    picked = f", picked as the best of {len(scored)} scores" if len(scored) > 1 else ""
-    seen = f"{row.name} ({place}): {_interval(row)}, {len(row.rows)} seeds{picked}"
+    confidence = widened_confidence(len(scored))
+    much = [here for one, here in places.items() if parse_count(one.size) >= MUCH_DATA]
+    whole = any(all(name in here for name in SIX) for here in much)
+    verdict: Verdict = "not decided"
+    if any(one.mean_at(confidence).low >= 0.9 for _, one in scored):
+        verdict = "holds"
+    elif whole and all(one.mean.high < 0.9 for _, one in scored):
+        verdict = "fails"
+    seen = f"the best of {len(scored)}: {row.name} ({place}): {_interval(row)}, {len(row.rows)} seeds"
     return Judged(claim, test, verdict, seen)
 
 
@@ -202,14 +233,22 @@ CLAIMS: tuple[Callable[[Rows], Judged], ...] = (
 )
 
 
-def _where(rows: Rows, needed: Sequence[str], *, size: int | None = None, task: str | None = None) -> Rows:
-    """Return the off-policy places on test objects with these rows, of a size and task where they are given."""
+def _where(rows: Rows, having: Sequence[str] = (), *, size: int | None = None, task: str | None = None) -> Rows:
+    """Return the off-policy places on test objects with some of the six, of a size and task where they are given.
+
+    Args:
+        rows: of all places.
+        having: rows that must be there.
+        size: of the dataset.
+        task: name of the task.
+    """
     return {
         place: here
         for place, here in rows.items()
         if place.setting == "off-policy"
         and place.split.startswith("test")
-        and all(name in here for name in needed)
+        and any(name in here for name in SIX)
+        and all(name in here for name in having)
         and size in (None, parse_count(place.size))
         and task in (None, place.task)
     }
@@ -217,6 +256,20 @@ def _where(rows: Rows, needed: Sequence[str], *, size: int | None = None, task: 
 
 def _named(here: Mapping[str, Scored], names: Sequence[str]) -> list[Scored]:
     return [here[name] for name in names if name in here]
+
+
+def _unready(places: Rows, names: Sequence[str]) -> str:
+    """Return which rows are not there or cannot be judged, in words; empty where all can be at all places."""
+    missing = [f"`{name}`: not run ({place})" for place, here in places.items() for name in names if name not in here]
+    unready = _unready_rows([row for here in places.values() for row in _named(here, names)])
+    return "; ".join([*missing, *([unready] if unready else [])])
+
+
+def _unready_rows(rows: Sequence[Scored]) -> str:
+    """Return which rows lack trainings or have one alone, in words; empty where none does."""
+    alone = "one training, which says nothing of another"
+    found = ((row.name, row.lacking or ("" if row.several else alone)) for row in rows)
+    return "; ".join(dict.fromkeys(f"`{name}`: {why}" for name, why in found if why))
 
 
 def _judged(
@@ -227,7 +280,7 @@ def _judged(
     missing: str,
     told: Callable[[Sequence[Compared]], Sequence[Compared]] = list,
 ) -> Judged:
-    """Return the verdict on pairs of rows, corrected within each family; not tested where a row lacks a run.
+    """Return the verdict on pairs of rows, corrected within each family.
 
     Args:
         claim: what the paper says.
@@ -237,32 +290,23 @@ def _judged(
         missing: what to say where there is no pair.
         told: the differences to show.
     """
-    every = [row for pairs in families for pair in pairs for row in pair]
-    lacking = _lacking(every)
-    if lacking:
-        return Judged(claim, test, "not tested", lacking)
     found = [one for pairs in families for one in compare([pair for pair in pairs if pair[0].same_scenes(pair[1])])]
     if not found:
-        return Judged(claim, test, "not tested", "no two rows met the same scenes" if every else missing)
+        return Judged(claim, test, "not tested", "no two rows met the same scenes" if any(families) else missing)
     return Judged(claim, test, decide(found), _list(told(found)))
-
-
-def _lacking(rows: Sequence[Scored]) -> str:
-    """Return which rows lack runs, in words; empty where none does."""
-    return "; ".join(dict.fromkeys(f"`{row.name}`: {row.lacking}" for row in rows if row.lacking))
 
 
 def _slight(found: Sequence[Compared], margin: float) -> Verdict:
     if all(one.difference.low > -margin and one.difference.high < margin for one in found):
         return "holds"
-    outside = any(one.difference.low > margin or one.difference.high < -margin for one in found)
+    outside = any(one.widened.low > margin or one.widened.high < -margin for one in found)
     return "fails" if outside else "not decided"
 
 
 def _not_below(found: Sequence[Compared], margin: float) -> Verdict:
     if all(one.difference.low > -margin for one in found):
         return "holds"
-    return "fails" if any(one.difference.high < -margin for one in found) else "not decided"
+    return "fails" if any(one.widened.high < -margin for one in found) else "not decided"
 
 
 def _all_better(found: Sequence[Compared]) -> Verdict:
@@ -285,23 +329,22 @@ def _not_worse(found: Sequence[Compared]) -> Sequence[Compared]:
     return [one for one in found if not one.worse] or found
 
 
-def _best_of(claim: str, test: str, rows: Rows, winners: Sequence[str], others: Sequence[str]) -> Judged:
-    families = [list(itertools.product(_named(here, winners), _named(here, others))) for here in rows.values()]
+def _best_of(claim: str, test: str, places: Rows, winners: Sequence[str], others: Sequence[str]) -> Judged:
+    unready = _unready(places, (*winners, *others))
+    if unready:
+        return Judged(claim, test, "not tested", unready)
+    families = [list(itertools.product(_named(here, winners), _named(here, others))) for here in places.values()]
     missing = f"{' and '.join(winners)} were not scored there beside others"
     return _judged(claim, test, families, _all_better, missing, told=_not_better)
 
 
 def _within(
-    claim: str, test: str, rows: Rows, candidates: Sequence[str], rivals: Sequence[str], margin: float
+    claim: str, test: str, places: Rows, candidates: Sequence[str], rivals: Sequence[str], margin: float
 ) -> Judged:
-    named = [(_named(here, candidates), _named(here, rivals)) for here in rows.values()]
-    lacking = _lacking([row for some, others in named for row in (*some, *others)])
-    if lacking:
-        return Judged(claim, test, "not tested", lacking)
-    families = []
-    for some, others in named:
-        best = max(others, key=lambda one: one.mean.value)
-        families.append([(one, best) for one in some])
+    unready = _unready_rows([row for here in places.values() for row in _named(here, (*candidates, *rivals))])
+    if unready:
+        return Judged(claim, test, "not tested", unready)
+    families = [list(itertools.product(_named(here, candidates), _named(here, rivals))) for here in places.values()]
     missing = f"not all of {', '.join((*candidates, *rivals))} were scored together"
     return _judged(claim, test, families, partial(_not_below, margin=margin), missing)
 

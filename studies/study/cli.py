@@ -92,7 +92,7 @@ def run(settings: RunSettings) -> int:
         click.echo(plan_text(settings.folder, cells, published))
         return 0
     status = run_study(plan, settings.folder, cells, retry_failed=settings.retry_failed, published=published)
-    if status != INTERRUPTED and any(cell.name in published or cell.state().status == "done" for cell in cells):
+    if status != INTERRUPTED and any(cell.name in published.runs or cell.state().status == "done" for cell in cells):
         _publish(settings)
     return status
 
@@ -144,9 +144,9 @@ def scores_of(settings: PublishSettings, plan: "StudyPlan") -> Path:
 
 
 def _published(settings: PublishSettings, plan: "StudyPlan", cells: "Sequence[Cell]") -> "Published":
-    from graspq.studies.study.scores import NOTHING, published_runs
+    from graspq.studies.study.scores import NOTHING, published_scores
 
-    return published_runs(plan, cells, scores_of(settings, plan)) if settings.keep_published else NOTHING
+    return published_scores(plan, cells, scores_of(settings, plan)) if settings.keep_published else NOTHING
 
 
 def _plan(settings: PlanSettings, workers: int | None = None, device: str = "auto") -> "tuple[StudyPlan, list[Cell]]":
@@ -159,7 +159,7 @@ def _plan(settings: PlanSettings, workers: int | None = None, device: str = "aut
 
 def plan_text(folder: Path, cells: "Sequence[Cell]", published: "Published") -> str:
     """Return a plan for the terminal: its trainings in order, how far each is, and the commands of the first to do."""
-    statuses = {cell.name: "published" if cell.name in published else cell.state().status for cell in cells}
+    statuses = {cell.name: "published" if cell.name in published.runs else cell.state().status for cell in cells}
     first = next((cell for cell in cells if statuses[cell.name] == "to do"), cells[0])
     width = max(map(len, statuses))
     lines = [f"{cell.digest[:12]}  {cell.name.ljust(width)}  {statuses[cell.name]}" for cell in cells]
@@ -172,6 +172,6 @@ def plan_text(folder: Path, cells: "Sequence[Cell]", published: "Published") -> 
         "",
     ]
     done = sum(one in ("done", "published") for one in statuses.values())
-    elsewhere = f", {len(published)} of them published" if published else ""
+    elsewhere = f", {len(published.runs)} of them published" if published.runs else ""
     lines.append(f"{len(cells)} trainings, {done} done{elsewhere}, {steps:,} steps in all, in {folder}")
     return "\n".join(lines)

@@ -14,7 +14,10 @@ from graspq.common.files import committed
 from graspq.studies.study.comparisons import Place, Scored
 
 INK, PALE = "#22262e", "#6b7280"
-COLORS = ("#3b6fb6", "#c8553d", "#5b9a5b", "#8c6bb1", "#d99b2b", "#4aa3a2", "#a25b76", "#7b7f86")
+COLORS = (
+    "#3b6fb6", "#c8553d", "#5b9a5b", "#8c6bb1", "#d99b2b", "#4aa3a2", "#a25b76", "#7b7f86",
+    "#8a6a3b", "#9ab8dd", "#e8a698", "#b5cf8a", "#c9b3dd",
+)  # fmt: skip
 Rows = Mapping[Place, Mapping[str, Scored]]
 Trainings = Mapping[Place, Mapping[str, Sequence[tuple[str, float]]]]
 References = Mapping[str, Sequence[Mapping[str, Any]]]
@@ -75,7 +78,9 @@ def bars(rows: Rows, references: References) -> Figure:
         axes.set_yticks(ticks, labels)
         axes.set_ylim(place_of - 0.6, -0.8)  # the first row on top
         split = next(place.split for place in rows if place.task == task)
-        label = "mean success of training seeds, with 95 % intervals"
+        several = any(row.several for place, here in rows.items() if place.task == task for row in here.values())
+        label = "mean success of training seeds" if several else "success of one training of each row"
+        label += ", with 95 % intervals"
         _frame(axes, f"{task.capitalize()} task, {split} split", "x", label)
     return figure
 
@@ -101,22 +106,23 @@ def _frame(axes: Axes, title: str, along: Literal["x", "y"] = "y", label: str = 
 
 def over_an_option(rows: Rows) -> Figure | None:
     """Return success over the option that most rows of one estimator differ in, such as n; None where there is none."""
-    curves: dict[tuple[str, str, Place], list[tuple[float, Scored]]] = {}
+    curves: dict[tuple[str, str, Place, frozenset[tuple[str, str]]], list[tuple[float, Scored]]] = {}
     for place, here in rows.items():
         for row in here.values():
-            for name, value in row.rows[0]["options"].items():
+            options = row.rows[0]["options"]
+            for name, value in options.items():
                 number = _number(value)
                 if number is not None and name in _varied(here, row.algo):
-                    curves.setdefault((row.algo, name, place), []).append((number, row))
+                    # Only where nothing else differs is it a curve.
+                    others = frozenset(options.items()) - {(name, value)}
+                    curves.setdefault((row.algo, name, place, others), []).append((number, row))
     kept = {key: sorted(points, key=lambda one: one[0]) for key, points in curves.items() if len(points) >= 3}
-    # Only where nothing else differs is it a curve.
-    kept = {key: points for key, points in kept.items() if len({value for value, _ in points}) == len(points)}
     if not kept:
         return None
-    options = sorted({(algo, name) for algo, name, _ in kept})
-    figure = Figure(figsize=(4.6 * len(options), 3.4), layout="constrained")
-    for axes, (algo, option) in zip(np.atleast_1d(figure.subplots(1, len(options))), options, strict=True):
-        some = [(place, points) for (one, name, place), points in kept.items() if (one, name) == (algo, option)]
+    panels = sorted({(algo, name) for algo, name, _, _ in kept})
+    figure = Figure(figsize=(4.6 * len(panels), 3.4), layout="constrained")
+    for axes, (algo, option) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
+        some = [(place, points) for (one, name, place, _), points in kept.items() if (one, name) == (algo, option)]
         for index, (place, points) in enumerate(some):
             x, means = [value for value, _ in points], [row.mean for _, row in points]
             color = COLORS[index % len(COLORS)]

@@ -1,5 +1,6 @@
 """What a study shows: its section of RESULTS.md, with tables of rows, differences and claims, and its figures."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +10,8 @@ from graspq.common.errors import UserError
 from graspq.common.files import write_text
 from graspq.common.text import markdown, write_jsonl
 from graspq.evaluate.choosing import ScoredCheckpoint, choosing
-from graspq.evaluate.statistics import wilson_interval
+from graspq.evaluate.results_table import outcomes_of
+from graspq.evaluate.statistics import SeveralRuns, mean_success
 from graspq.studies.study.claims import judged
 from graspq.studies.study.comparisons import (
     Compared,
@@ -17,6 +19,10 @@ from graspq.studies.study.comparisons import (
     Scored,
     against,
     asked_rows,
+    difference_text,
+    objects_in_scenes,
+    p_text,
+    reference_row,
     scored_rows,
     trainings,
     unequal_steps,
@@ -108,11 +114,12 @@ def facts(plan: Path, table: Table, scores: Path, rows: Rows) -> str:
     code = sorted({str(one.get("trained_by"))[:8] for one in done} | {str(one.get("scored_by"))[:8] for one in done})
     data = sorted({str(one.get("data_sha256"))[:12] for one in done})
     objects = sorted({str(one["object_set_sha256"])[:12] for one in done})
-    trainings_each = {len(row.rows) for here in rows.values() for row in here.values()}
-    over = "new training seeds, scenes and objects"
-    if trainings_each == {1}:
-        over = "new scenes and objects, for the one training of each row"
-    elif 1 in trainings_each:
+    scored = [row for here in rows.values() for row in here.values()]
+    things = "scenes and objects" if all(row.counts is not None for row in scored) else "scenes of these objects"
+    over = f"new training seeds, {things} with this one dataset"
+    if not any(row.several for row in scored):
+        over = f"new {things}, for the one training of each row (another may lie as far off again)"
+    elif not all(row.several for row in scored):
         over += " (of a row with one training: for that one)"
     chosen = " Choices are made on such scores, which flatters what was chosen."
     if all(one.startswith("test") for one in splits):
@@ -135,18 +142,21 @@ def references(table: Table) -> dict[str, list[Mapping[str, Any]]]:
 
 
 def row_table(rows: Rows, table: Table, reference: str | None = None) -> str:
-    """Return the table by task, size and row, best first, with each row's difference to the best or to `reference`."""
+    """Return the table by task, size and row, with each row's difference to the best or to `reference`.
+
+    The best comes first, rows of which a training failed come last. Of a row with one training a difference has no
+    interval, and one that lacks a training no p-value.
+    """
     lines = []
     beside, told = references(table), set[str]()
     for place, here in rows.items():
         compared = {} if unequal_steps(here) else against(here, reference)
-        for row in sorted(here.values(), key=lambda one: -one.mean.value):
-            lines.append(_row(place, row, compared.get(row.name)))
-        for one in beside.get(place.task, []) if place.task not in told else []:
-            low, high = wilson_interval(one["successes"], one["episodes"])
-            lines.append(
-                [one["policy"], place.task, "", f"{one['success_rate']:.3f}", f"{low:.3f} to {high:.3f}", *[""] * 6]
-            )
+        one = None if unequal_steps(here) else reference_row(here, reference)
+        for row in sorted(here.values(), key=lambda row: (bool(row.failures), -row.mean.value)):
+            lines.append(_row(place, row, one, compared.get(row.name)))
+        for policy in beside.get(place.task, []) if place.task not in told else []:
+            mean = reference_mean(policy, table)
+            lines.append([policy["policy"], place.task, "", f"{mean.value:.3f}", _interval(mean), *[""] * 6])
         told.add(place.task)
     heads = [
         "row",
@@ -165,24 +175,39 @@ def row_table(rows: Rows, table: Table, reference: str | None = None) -> str:
         for row in here.values()
         if row.failures
     ]
-    begun = {row for here in asked_rows(table).values() for row in here}
-    unbegun = sorted({one["row"] for one in table if one["kind"] == "run"} - begun)
+    every = [row for here in asked_rows(table).values() for row in here.values()]
+    unbegun = sorted({row.name for row in every} - {row.name for row in every if row.rows or row.failures})
     text += "\nFailed: " + ". ".join(failed) + ".\n" if failed else ""
     return text + ("\nNot run: " + ", ".join(f"`{name}`" for name in unbegun) + ".\n" if unbegun else "")
 
 
-def _row(place: Place, row: Scored, compared: Compared | None) -> list[str]:
+def reference_mean(line: Mapping[str, Any], table: Table) -> SeveralRuns:
+    """Return the mean success of a policy without a run, with its interval over new scenes and objects.
+
+    Args:
+        line: of the table of scores, of kind `reference`.
+        table: all of it.
+    """
+    counts = objects_in_scenes(table).get((line["task"], line["split"], line["episodes"]))
+    return mean_success(outcomes_of(dict(line))[None], counts)
+
+
+def _interval(mean: SeveralRuns) -> str:
+    return f"{mean.low:.3f} to {mean.high:.3f}"
+
+
+def _row(place: Place, row: Scored, reference: Scored | None, compared: Compared | None) -> list[str]:
     mean, first = row.mean, row.rows[0]
-    difference, p = ("", "")
-    if compared is not None:
-        one = compared.difference
-        difference = f"{one.value:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
-        p = f"{compared.p_value:.3f}" if compared.p_value >= 0.001 else "< 0.001"
+    difference = ""
+    if reference is not None and reference is not row:
+        found = row.less(reference)
+        difference = difference_text(found) if row.several and reference.several else f"{found.value:+.3f}"
+    p = p_text(compared.p_value) if compared is not None else ""
     size = place.size if place.setting == "off-policy" else f"{place.size}, {place.setting}"
     discount = first.get("discount")
     name = f"`{row.name}`" + (f" ({row.lacking})" if row.lacking else "")
     return [
-        name, place.task, size, f"{mean.value:.3f}", f"{mean.low:.3f} to {mean.high:.3f}",
+        name, place.task, size, f"{mean.value:.3f}", _interval(mean),
         " ".join(f"{rate:.3f}" for rate in row.rates), difference, p,
         f"{discount:g}" if discount is not None else "", f"{first['steps']:,}", f"`{first['recipe_sha256'][:8]}`",
     ]  # fmt: skip
@@ -199,11 +224,30 @@ def choosing_table(rows: Rows) -> str:
             if one.get("validation")
         ]
         lines += [
-            [one.words, str(place), _rho(one.within), _rho(one.correlation), str(one.checkpoints)]
+            [
+                one.words,
+                str(place),
+                _rho(one.within),
+                _rho(one.correlation),
+                by_chance(one.checkpoints),
+                str(one.checkpoints),
+            ]
             for one in choosing(runs)
         ]
-    heads = ["held-back measure", "at", "Spearman's ρ with success within an estimator", "over all", "runs"]
+    heads = [
+        "held-back measure",
+        "at",
+        "Spearman's ρ with success within an estimator",
+        "over all",
+        "by chance",
+        "runs",
+    ]
     return markdown(heads, lines) if lines else ""
+
+
+def by_chance(count: int) -> str:
+    """Return between what a rank correlation of so many runs lies 19 times in 20 where there is no relation."""
+    return f"±{min(1.96 / math.sqrt(count - 1), 1.0):.2f}"
 
 
 def _rho(correlation: float | None) -> str:

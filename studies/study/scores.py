@@ -4,8 +4,8 @@ The file is made anew from the evaluations' own files each time, never added to.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from graspq.common.errors import UserError
@@ -25,9 +25,30 @@ OF_AN_EVALUATION = (
 )  # fmt: skip
 KINDS = ("scenes", "reference", "run")
 
-Published = Mapping[str, dict[str, Any]]
-"""Lines of runs that were scored elsewhere, by the names of their cells."""
-NOTHING: Published = MappingProxyType({})
+
+@dataclass(frozen=True)
+class Published:
+    """What was scored elsewhere and is not done again here.
+
+    Attributes:
+        runs: lines of runs by the names of their cells.
+        beside: lines of policies without a run, and of the objects in the scenes, which the runs met.
+    """
+
+    runs: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    beside: tuple[dict[str, Any], ...] = ()
+
+    def reference(self, policy: str, task: str) -> dict[str, Any] | None:
+        """Return the line of a policy without a run on a task, if it is there."""
+        found = (one for one in self.beside if one["kind"] == "reference")
+        return next((one for one in found if (one["policy"], one["task"]) == (policy, task)), None)
+
+    def scenes(self, task: str) -> dict[str, Any] | None:
+        """Return the line of the objects in the scenes of a task, if it is there."""
+        return next((one for one in self.beside if one["kind"] == "scenes" and one["task"] == task), None)
+
+
+NOTHING = Published()
 
 
 def write_scores(
@@ -42,23 +63,24 @@ def write_scores(
         plan: the plan.
         folder: of the study.
         cells: its cells.
-        published: lines that stand for cells whose runs are elsewhere, see `published_runs`.
+        published: lines that stand for what was scored elsewhere, see `published_scores`.
     """
     frozen = read_recipe(plan.recipe)["rows"] if plan.recipe.exists() else {}
     runs = [
-        published.get(cell.name) or run_row(plan, cell, frozen.get(key_of(cell), {}).get("digest") == cell.digest)
+        published.runs.get(cell.name) or run_row(plan, cell, frozen.get(key_of(cell), {}).get("digest") == cell.digest)
         for cell in cells
     ]
-    references = list(_references(plan, folder))
-    rows = [*_scenes(plan, folder, cells), *references, *runs]
+    references = list(_references(plan, folder, published))
+    rows = [*_scenes(plan, folder, cells, published), *references, *runs]
     write_jsonl(folder / SCORES_FILE, rows)
     return rows
 
 
-def published_runs(plan: StudyPlan, cells: Sequence[Cell], path: Path) -> Published:
-    """Return the lines of published scores that are runs of the plan's cells, which need not be done again then.
+def published_scores(plan: StudyPlan, cells: Sequence[Cell], path: Path) -> Published:
+    """Return the lines of published scores that are of the plan, which need not be done again then.
 
     Only what was trained by the very recipe, and scored on as many scenes of the same split, counts; not what failed.
+    With it come the policies beside and the objects in the scenes that it met.
 
     Args:
         plan: the plan.
@@ -71,7 +93,8 @@ def published_runs(plan: StudyPlan, cells: Sequence[Cell], path: Path) -> Publis
     here = {(cell.row, cell.task, cell.size, cell.seed): cell for cell in cells}
     asked = {"split": plan.split, "setting": plan.values["setting"], "episodes": plan.values["episodes"]}
     found, digests = {}, dict[Path, str]()
-    for line in read_scores([path]) if path.exists() else []:
+    lines = read_scores([path]) if path.exists() else []
+    for line in lines:
         if line["kind"] != "run" or line["status"] != "done":
             continue
         cell = here.get((line["row"], line["task"], line["size"], line["seed"]))
@@ -84,7 +107,17 @@ def published_runs(plan: StudyPlan, cells: Sequence[Cell], path: Path) -> Publis
         if digests.get(data, line["data_sha256"]) != line["data_sha256"]:
             raise UserError(f"{path}: {cell.name} was trained on other data than {data}; give another --results")
         found[cell.name] = line
-    return found
+    met = {_met(line) for line in found.values()}
+    beside = [line for line in lines if line["kind"] == "reference" and _met(line) in met]
+    places = {one[:3] for one in met}
+    scenes = [line for line in lines if line["kind"] == "scenes"]
+    beside += [one for one in scenes if (one["task"], one["split"], len(one["object_ids"])) in places]
+    return Published(found, tuple(beside))
+
+
+def _met(line: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return what says on which scenes a line was scored."""
+    return line["task"], line["split"], line["episodes"], line["object_set_sha256"]
 
 
 def run_row(plan: StudyPlan, cell: Cell, frozen: bool) -> dict[str, Any]:
@@ -128,16 +161,18 @@ def _score(evaluation: Evaluation) -> dict[str, Any]:
     return {name: found[name] for name in OF_AN_EVALUATION}
 
 
-def _references(plan: StudyPlan, folder: Path) -> Iterator[dict[str, Any]]:
+def _references(plan: StudyPlan, folder: Path, published: Published) -> Iterator[dict[str, Any]]:
     for task in plan.values["tasks"]:
         for policy in plan.values["policies"]:
-            found = reference(plan, folder, policy, task)
+            found, elsewhere = reference(plan, folder, policy, task), published.reference(policy, task)
             if found is not None:
                 own = {"kind": "reference", "policy": policy, "task": task, "split": plan.split}
                 yield own | _score(found)
+            elif elsewhere is not None:
+                yield elsewhere
 
 
-def _scenes(plan: StudyPlan, folder: Path, cells: Sequence[Cell]) -> Iterator[dict[str, Any]]:
+def _scenes(plan: StudyPlan, folder: Path, cells: Sequence[Cell], published: Published) -> Iterator[dict[str, Any]]:
     for task in plan.values["tasks"]:
         known = (reference(plan, folder, policy, task) for policy in plan.values["policies"])
         found = next((one for one in known if one is not None), None)
@@ -147,6 +182,8 @@ def _scenes(plan: StudyPlan, folder: Path, cells: Sequence[Cell]) -> Iterator[di
         if found is not None:
             ids = [list(row.object_ids) for row in found.rows()]
             yield {"kind": "scenes", "task": task, "split": plan.split, "seed": SCENES_SEED, "object_ids": ids}
+        elif (elsewhere := published.scenes(task)) is not None:
+            yield elsewhere
 
 
 def reference(plan: StudyPlan, folder: Path, policy: str, task: str) -> Evaluation | None:

@@ -78,7 +78,7 @@ def run_study(
         folder: of the study.
         cells: its cells.
         retry_failed: train again what failed.
-        published: scores that stand for cells, which are not done again; see `published_runs`.
+        published: scores that stand for cells, which are not done again; see `published_scores`.
 
     Raises:
         UserError: the plan cannot be carried out as it stands; no training was started then.
@@ -86,7 +86,7 @@ def run_study(
     require_frozen(plan, cells)
     check_runs(cells)
     wanted = ("to do", "failed") if retry_failed else ("to do",)
-    here = [cell for cell in cells if cell.name not in published]
+    here = [cell for cell in cells if cell.name not in published.runs]
     todo = [cell for cell in here if cell.state().status in wanted]
     check_commands(todo)
     writable_folder(folder, "study")
@@ -95,7 +95,7 @@ def run_study(
         for cell in todo:
             cell.failure_note.unlink(missing_ok=True)
         finished = len(cells) - len(todo)
-        elsewhere = f", {len(published)} of them published" if published else ""
+        elsewhere = f", {len(published.runs)} of them published" if published.runs else ""
         click.echo(f"{folder}: {finished} of {len(cells)} trainings finished before{elsewhere}", err=True)
 
         def report(ending: Ending[Cell]) -> None:
@@ -109,7 +109,7 @@ def run_study(
             carry_out(collections(plan, cells), lambda ending: None, keep_going=False)
             for some in by_dataset(todo).values():
                 check_data(some[0].settings, some)
-            carry_out(references(plan, cells), lambda ending: None, keep_going=False)
+            carry_out(references(plan, cells, published), lambda ending: None, keep_going=False)
             write_scores(plan, folder, cells, published)
             carry_out(here, report, hand_out=hand_out)
         except KeyboardInterrupt:
@@ -138,8 +138,11 @@ def _holds(folder: Path, count: int) -> bool:
     return (folder / MANIFEST_NAME).is_file() and Manifest.load(folder).episodes >= count
 
 
-def references(plan: StudyPlan, cells: Sequence[Cell]) -> Iterator[Called]:
-    """Yield the units that score policies without a run on the scenes of a task, which are those of all its rows."""
+def references(plan: StudyPlan, cells: Sequence[Cell], published: Published) -> Iterator[Called]:
+    """Yield the units that score policies without a run on the scenes of a task, which are those of all its rows.
+
+    What is published is not scored again.
+    """
     seen: set[str] = set()
     for (task, size), some in by_dataset(cells).items():
         if task in seen:
@@ -147,6 +150,8 @@ def references(plan: StudyPlan, cells: Sequence[Cell]) -> Iterator[Called]:
         seen.add(task)
         objects, settings = objects_beside([plan.dataset(task, size)]), some[0].settings
         for policy in plan.values["policies"]:
+            if published.reference(policy, task) is not None:
+                continue
             words = ["--policy", policy, "--task", task, "--split", plan.split]
             words += ["--episodes", str(settings.episodes), "--seed", str(SCENES_SEED)]
             words += ["--objects", str(objects)] if objects is not None else []

@@ -49,7 +49,7 @@ def reference(policy: str, rate: float) -> dict[str, Any]:
     return {"kind": "reference", "policy": policy, "task": "regular", "split": "test"} | score(outcomes(rate, 0))
 
 
-def study(**rates: float) -> list[dict[str, Any]]:
+def study(seeds: int = 3, **rates: float) -> list[dict[str, Any]]:
     """A study of these rows; an underscore in a name stands for a dash."""
-    rows = [row for name, rate in rates.items() for row in runs(name.replace("_", "-"), rate)]
+    rows = [row for name, rate in rates.items() for row in runs(name.replace("_", "-"), rate, seeds=seeds)]
     return [scenes(), reference("random", 0.2), reference("oracle", 0.98), *rows]

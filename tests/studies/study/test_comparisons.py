@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from graspq.common.errors import UserError
-from graspq.studies.study.comparisons import Place, against, scored_rows
+from graspq.studies.study.comparisons import Place, against, asked_rows, reference_row, scored_rows
 from tests.studies.study.scored_studies import runs, study
 
 PLACE = Place("regular", "10k", "off-policy", "test")
@@ -55,3 +55,33 @@ def test_the_others_are_compared_with_the_best_row() -> None:
 def test_a_named_row_takes_the_place_of_the_best() -> None:
     found = against(scored_rows(study(dql=0.9, mc=0.7, pcl=0.8))[PLACE], "mc")
     assert {(one.first, one.second, one.better) for one in found.values()} == {("dql", "mc", True), ("pcl", "mc", True)}
+
+
+def test_p_values_count_all_pairs_where_the_row_to_compare_with_was_picked_by_them() -> None:
+    rates = {"dql": 0.9, "mc": 0.87, "pcl": 0.86, "ddpg": 0.5, "nstep": 0.4}
+    rows = scored_rows(study(**rates))[PLACE]
+    picked, named = against(rows), against(rows, "dql")
+    assert {one.second for one in picked.values()} == {"dql"} and picked.keys() == named.keys()
+    raw = {name: one.difference.p_value for name, one in named.items()}
+    assert [picked[name].difference for name in raw] == [named[name].difference for name in raw]
+    assert picked["ddpg"].p_value == pytest.approx(min(10 * raw["ddpg"], 1), rel=10)
+    assert all(picked[name].p_value >= named[name].p_value for name in raw)
+    assert picked["mc"].p_value > named["mc"].p_value or named["mc"].p_value == 1
+    wider = named["mc"].widened
+    assert wider.low < named["mc"].difference.low and wider.high > named["mc"].difference.high
+
+
+def test_the_row_to_compare_with_is_the_best_whose_trainings_are_all_done() -> None:
+    table = study(dql=0.8, mc=0.7)
+    failed = runs("ddpg", 0.95) + runs("ddpg", 0.0, seeds=1, seed=3, status="failed", reason="diverged")
+    begun = runs("pcl", 0.9) + runs("pcl", 0.0, seeds=1, seed=3, status="to do")
+    rows = scored_rows(table + failed + begun)[PLACE]
+    assert reference_row(rows).name == "dql" and set(against(rows)) == {"mc"}
+    assert reference_row(scored_rows(failed + begun)[PLACE]).name == "pcl"
+    assert reference_row(rows, "ddpg").name == "ddpg" and against(rows, "ddpg") == {}
+    assert (rows["ddpg"].lacking, rows["pcl"].lacking) == ("1 of 4 trainings failed", "3 of 4 trainings done")
+
+
+def test_rows_that_were_not_begun_are_asked_for_and_not_scored() -> None:
+    table = study(dql=0.8) + runs("pcl", 0.0, status="to do")
+    assert asked_rows(table)[PLACE]["pcl"].lacking == "0 of 3 trainings done" and "pcl" not in scored_rows(table)[PLACE]

@@ -6,7 +6,7 @@ import pytest
 
 from graspq.common.errors import UserError
 from graspq.studies.study.cells import cells_of
-from graspq.studies.study.claims import FEWEST_POINTS, LEAST_FRESH
+from graspq.studies.study.claims import FEWEST_TRAININGS, LEAST_FRESH
 from graspq.studies.study.plan_file import read_plan
 
 PLANS = Path(__file__).resolve().parents[3] / "studies" / "plans"
@@ -88,4 +88,4 @@ def test_the_plan_of_fresh_grasps_asks_for_a_tenth_of_the_data_and_lets_explorat
 def test_the_plan_of_stability_has_as_many_trainings_of_both_kinds_as_the_claim_asks_for() -> None:
     plan = read_plan(PLANS / "stability.toml")
     algos = [cell.algo for cell in cells_of(plan, Path("study"), workers=1)]
-    assert all(algos.count(algo) >= FEWEST_POINTS for algo in ("ddpg", "dql", "mc"))
+    assert all(algos.count(algo) >= FEWEST_TRAININGS for algo in ("ddpg", "dql", "mc"))

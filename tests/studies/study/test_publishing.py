@@ -1,15 +1,18 @@
 """What a study shows: one section of a page, written anew in its place, and figures."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import pytest
 
 from graspq.common.errors import UserError
+from graspq.evaluate.statistics import mean_success, object_counts
 from graspq.studies.study.comparisons import scored_rows
 from graspq.studies.study.publishing import choosing_table, publish, section, with_section
 from graspq.studies.study.scores import read_scores
-from tests.studies.study.scored_studies import runs, study
+from tests.studies.study.scored_studies import outcomes, runs, scenes, study
 
 PLAN = Path("plans/s.toml")
 
@@ -50,10 +53,10 @@ def test_measures_that_choose_without_a_simulator_are_ranked_by_their_sign_withi
     lines = choosing_table(scored_rows(table)).splitlines()[2:]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [line[:3] + line[4:] for line in cells] == [
-        ["held-back loss", "regular, 10k, off-policy, test", "+1.00", "6"],
-        ["OPC", "regular, 10k, off-policy, test", "-1.00", "6"],
-        ["held-back loss", "regular, 1k, off-policy, test", "+1.00", "3"],
-        ["OPC", "regular, 1k, off-policy, test", "-1.00", "3"],
+        ["held-back loss", "regular, 10k, off-policy, test", "+1.00", "±0.88", "6"],
+        ["OPC", "regular, 10k, off-policy, test", "-1.00", "±0.88", "6"],
+        ["held-back loss", "regular, 1k, off-policy, test", "+1.00", "±1.00", "3"],
+        ["OPC", "regular, 1k, off-policy, test", "-1.00", "±1.00", "3"],
     ]
 
 
@@ -79,16 +82,56 @@ def test_differences_are_to_the_row_that_the_plan_names() -> None:
 @pytest.mark.parametrize(
     ("seeds", "over"),
     [
-        ((3, 3), "over new training seeds, scenes and objects;"),
-        ((3, 1), "over new training seeds, scenes and objects (of a row with one training: for that one);"),
-        ((1, 1), "over new scenes and objects, for the one training of each row;"),
+        ((3, 3), "new training seeds, scenes and objects with this one dataset;"),
+        (
+            (3, 1),
+            "new training seeds, scenes and objects with this one dataset (of a row with one training: for that one",
+        ),
+        ((1, 1), "new scenes and objects, for the one training of each row (another may lie as far off again);"),
     ],
 )
 def test_intervals_are_said_to_hold_for_new_trainings_where_there_are_several(
     seeds: tuple[int, int], over: str
 ) -> None:
-    table = [*runs("dql", 0.9, seeds=seeds[0]), *runs("mc", 0.7, seeds=seeds[1])]
-    assert f"Intervals are 95 %, {over}" in section("s", PLAN, table, [], [Path("s.jsonl")])
+    table = [scenes(), *runs("dql", 0.9, seeds=seeds[0]), *runs("mc", 0.7, seeds=seeds[1])]
+    assert f"Intervals are 95 %, over {over}" in section("s", PLAN, table, [], [Path("s.jsonl")])
+
+
+def test_intervals_speak_of_these_objects_alone_where_nobody_knows_which_lay_where() -> None:
+    text = section("s", PLAN, runs("dql", 0.9), [], [Path("s.jsonl")])
+    assert "over new training seeds, scenes of these objects with this one dataset;" in text
+
+
+def row_of(name: str, table: list[dict[str, Any]]) -> list[str]:
+    """Return the cells of a row of the table: its name, then success, interval, seeds, difference and p."""
+    text = section("s", PLAN, table, [], [Path("s.jsonl")])
+    (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} ")]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    return [cells[0], *cells[3:8]]
+
+
+def test_a_single_training_is_told_apart_from_nothing_and_an_unfinished_row_is_not_tested() -> None:
+    best = study(dql=0.9)
+    assert re.fullmatch(r"-0\.\d{3}", row_of("`mc`", best + runs("mc", 0.7, seeds=1))[4])
+    assert row_of("`mc`", best + runs("mc", 0.7, seeds=1))[5] == ""
+    begun = best + runs("mc", 0.7) + runs("mc", 0.7, seeds=1, seed=3, status="to do")
+    assert "(-0." in row_of("`mc`", begun)[4] and row_of("`mc`", begun)[5] == ""
+    assert row_of("`mc`", best + runs("mc", 0.7))[5] == "< 0.001"
+
+
+def test_a_row_of_which_trainings_failed_is_no_best_and_stands_last() -> None:
+    table = study(dql=0.8, mc=0.7, ddpg=0.95) + runs("ddpg", 0.0, seeds=1, seed=3, status="failed", reason="diverged")
+    text = section("s", PLAN, table, [], [Path("s.jsonl")])
+    names = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| `")]
+    assert names[:3] == ["`dql`", "`mc`", "`ddpg` (1 of 4 trainings failed)"]
+    assert row_of("`dql`", table)[4:] == ["", ""] and row_of("`mc`", table)[4].startswith("-0.0")
+    assert row_of("`ddpg`", table)[4].startswith("+0.1") and row_of("`ddpg`", table)[5] == ""
+
+
+def test_random_and_oracle_have_the_same_kind_of_interval_as_the_rows() -> None:
+    table = study(dql=0.9)
+    mean = mean_success(outcomes(0.2, 0)[None], object_counts(scenes()["object_ids"]))
+    assert row_of("random", table)[2] == f"{mean.low:.3f} to {mean.high:.3f}"
 
 
 def test_scores_of_validation_are_named_as_those_that_were_chosen_on(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_a_study_goes_on_in_another_clone_from_what_was_published(
     published = Path("results/study-tiny.jsonl")
     lines = read_scores([published])
     assert [line["kind"] for line in lines] == ["scenes", "reference", "run"]
-    lines[2]["marked"] = 1
+    lines[0]["marked"] = lines[1]["marked"] = lines[2]["marked"] = 1
     published.write_text(checked_lines(lines))
 
     plan(one, data=data)
@@ -99,10 +99,16 @@ def test_a_study_goes_on_in_another_clone_from_what_was_published(
     assert re.findall(r"-seed(\d) +(published|to do)\n", planned) == [("0", "published"), ("1", "to do")]
     assert "The commands of mc-regular-12-seed1" in planned and "--seed 1" in planned
     assert "2 trainings, 1 done, 1 of them published" in planned and not Path("second").exists()
+    Path("second").mkdir()
+    assert grasp_study("report", "tiny.toml", "--keep-published", "--out", "second") == 0
+    assert read_scores([published])[:3] == lines  # the objects of the scenes too, where no evaluation is here
+    capfd.readouterr()
     assert grasp_study(*words, "--out", "second") == 0
     assert "1 of 2 trainings finished before, 1 of them published" in capfd.readouterr().err
     assert [path.name for path in Path("second/runs").iterdir()] == ["mc-regular-12-seed1"]
-    rows = read_scores([published])[2:]
+    assert not Path("second/references").exists()  # nor is what stands beside the runs scored again
+    (scenes, reference, *rows) = read_scores([published])
+    assert scenes["object_ids"] == lines[0]["object_ids"] and reference["marked"] == 1
     assert [(row["seed"], row["status"], "marked" in row) for row in rows] == [(0, "done", True), (1, "done", False)]
     assert "2 of 2 trainings" in Path("RESULTS.md").read_text()
 

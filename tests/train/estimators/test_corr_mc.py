@@ -263,7 +263,9 @@ def test_the_papers_step_goes_down_the_gradient_of_the_target_and_the_default_st
 
 
 def test_the_gradient_of_targets_is_refused_with_a_loss_whose_slope_there_never_vanishes() -> None:
-    with pytest.raises(UserError, match="--judge online-gradient: expected --loss squared or huber, got --loss cross-entropy"):
+    with pytest.raises(
+        UserError, match="--judge online-gradient: expected --loss squared or huber, got --loss cross-entropy"
+    ):
         CorrMcSettings(judge="online-gradient")
 
 
