@@ -17,7 +17,6 @@ import numpy as np
 from graspq.common.errors import UserError
 from graspq.common.files import LOCK_NAME, locked, remove_temporaries, writable_folder
 from graspq.common.named_objects import source_digest
-from graspq.common.options import flag
 from graspq.common.provenance import code_revision, versions
 from graspq.evaluate.films import write_films
 from graspq.evaluate.jobs import Job
@@ -39,7 +38,6 @@ from graspq.evaluate.statistics import wilson_interval
 from graspq.objects.object_set import ObjectSet
 from graspq.policies.named import ScoredPolicy, policy_named
 from graspq.sim.task import Task, task_from_json, task_named
-from graspq.train.search_settings import CemSettings
 
 if TYPE_CHECKING:
     from graspq.policies.of_run import RunPolicy
@@ -276,8 +274,4 @@ def command_of(job: Job) -> str:
     words += ["--split", job.split, "--episodes", str(job.episodes), "--seed", str(job.seed)]
     words += ["--objects", job.objects.as_posix()] if job.objects is not None else []
     words += ["--checkpoint", str(job.checkpoint)] if job.checkpoint is not None else []
-    usual = CemSettings()
-    for name, value in job.cem.to_json().items():
-        if value != getattr(usual, name):
-            words += [flag(f"cem_{name}"), str(value)]
-    return shlex.join(words)
+    return shlex.join([*words, *job.cem.words()])

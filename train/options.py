@@ -20,7 +20,7 @@ PRESET = click.Option(
     type=click.Choice(["default", "paper"]),
     default="default",
     show_default=True,
-    help="What decides the options that are not given: our defaults, or the paper's text and its released code.",
+    help="What decides the options that are not given: our defaults, or the paper's released code.",
 )
 
 

@@ -80,7 +80,7 @@ class Recipe(Settings):
 
 DEFAULT = Recipe()
 
-# Source: the paper's text, and where it is silent its released code (`env_procedural` and `get_data`).
+# Source: the released code of the paper (`env_procedural` and `get_data`), and its text where there is no code.
 PAPER = Recipe(
     steps=2_000_000,
     network="paper",

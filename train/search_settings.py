@@ -4,9 +4,9 @@ import dataclasses
 from typing import Literal
 
 from graspq.common.errors import UserError
-from graspq.common.options import Settings, setting
+from graspq.common.options import Settings, flag, setting
 
-Answer = Literal["mean", "best"]
+Answer = Literal["mean", "best", "last"]
 StepMode = Literal["scale", "clip"]
 
 
@@ -20,7 +20,7 @@ class CemSettings(Settings):
     iterations: int = setting(3, help="Iterations of CEM.", minimum=1, maximum=100)
     samples: int = setting(64, help="Actions drawn in each iteration.", minimum=2, maximum=100_000)
     elites: int = setting(10, help="Best actions that a normal distribution is fitted to.", minimum=2)
-    answer: Answer = setting("mean", help="The mean of the last elites, or the best of all samples.")
+    answer: Answer = setting("mean", help="The mean of the last elites, or the best sample, of all or of the last.")
     views: int = setting(6, help="Pictures of a state of which the smallest Q counts.", minimum=1, maximum=6)
     synthetic_step: StepMode = setting(
         "scale", help="How a motion of supervised becomes a step: scaled to the limits, or each part clipped to them."
@@ -36,6 +36,12 @@ class CemSettings(Settings):
         if self.elites > self.samples:
             raise UserError(f"CEM elites: expected at most as many as samples ({self.samples}), got {self.elites}")
 
+    def words(self) -> list[str]:
+        """Return the options of a command that give this search; those at their defaults are left out."""
+        usual = CemSettings()
+        given = {name: value for name, value in self.to_json().items() if value != getattr(usual, name)}
+        return [word for name, value in given.items() for word in (flag(f"cem_{name}"), str(value))]
+
 
 @dataclasses.dataclass(frozen=True)
 class CemOptions(Settings):
@@ -45,7 +51,8 @@ class CemOptions(Settings):
     cem_samples: int = setting(CemSettings.samples, help="Actions drawn in each iteration of CEM.", minimum=2)
     cem_elites: int = setting(CemSettings.elites, help="Best actions that CEM is fitted to.", minimum=2)
     cem_answer: Answer = setting(
-        CemSettings.answer, help="What CEM acts by: the mean of the last elites, or the best of all samples."
+        CemSettings.answer,
+        help="What CEM acts by: the mean of the last elites, the best of all samples, or of the last iteration's.",
     )
 
     cem_views: int = setting(

@@ -82,7 +82,8 @@ def cross_entropy_method(
 
         first iteration:   aᵢ = clip(μ₀ + σ₀ εᵢ, low, high)
         later iterations:  aᵢ = clip(μ + σ εᵢ, low, high),  μ, σ = mean and standard deviation (n - 1) of the elites
-        answer:            μ of the last iteration's elites ("mean"), or the best of all samples ("best")
+        answer:            μ of the last iteration's elites ("mean"), or the best of all samples ("best"), or of that
+                           iteration's ("last")
 
     Args:
         q_of_actions: Q-function of candidates.
@@ -99,7 +100,7 @@ def cross_entropy_method(
 
     Source: Quillen et al. 2018, section "Learning to Grasp with Supervised Learning" (3 iterations, 64 samples).
     Start and number of elites are the released code's. Where the search starts matters: see docs/estimators/dql.md.
-    Differs: the released code does not clip, and takes the best of the last iteration; the answer is the mean here.
+    Differs: the released code does not clip; its answer is "last".
     """
     if noise.dim() != 4 or not 2 <= elites <= noise.shape[2]:
         raise ValueError(
@@ -117,6 +118,8 @@ def cross_entropy_method(
         best = _better(best, best_of(candidates, q))
     if answer == "best":
         return best
+    if answer == "last":
+        return best_of(candidates, q)
     _, mean = _elite_moments(candidates, q, elites)
     return Choice(mean.squeeze(1), q_of_actions(mean).squeeze(1))
 

@@ -17,7 +17,6 @@ from graspq.studies.sweep.commands import CommandLine, training_options
 from graspq.studies.sweep.settings import SweepSettings
 from graspq.studies.sweep.trial import Trial
 from graspq.train.recipe import Recipe
-from graspq.train.search_settings import CemSettings
 from graspq.train.settings import complete
 
 
@@ -67,9 +66,9 @@ class Cell(Trial):
             from graspq.studies.online.resolve import resolve
 
             plan = resolve(given)
-            return deciding(plan.train.to_json(), CemSettings(), plan.described())
+            return deciding(plan.train.to_json(), self.settings.cem, plan.described())
         training = complete({name: value for name, value in given.items() if name != "preset"}, given["preset"])
-        return deciding(training.to_json(), CemSettings())
+        return deciding(training.to_json(), self.settings.cem)
 
     @property
     def digest(self) -> str:
@@ -118,6 +117,7 @@ def _settings(
         workers=asked if asked is not None or not local else max(available_cores() // threads, 1),
         threads=threads,
         out=folder,
+        **plan.search,
     ).complete()
 
 

@@ -16,6 +16,7 @@ from graspq.studies.sweep.grid import MOST_TRIALS
 from graspq.studies.sweep.settings import SET_BY_SWEEP
 from graspq.studies.sweep.trial import Options
 from graspq.train.estimators import estimator_named
+from graspq.train.search_settings import CemOptions
 
 OFF_POLICY, ON_POLICY = "off-policy", "on-policy"
 # What a plan may say: its key, its kinds, what is taken where it is not said, what was expected.
@@ -30,6 +31,7 @@ KEYS: dict[str, tuple[tuple[type, ...], Any, str]] = {
     "steps": ((int, str), None, "a number of training steps, such as 3000"),
     "split": ((str,), "validation", "a split of the object set"),
     "episodes": ((int,), 1000, f"a number of grasps that each run is scored on, at least {FEWEST_SCENES}"),
+    "cem": ((dict,), {}, "a table of settings of the search, such as {answer = 'last', views = 1}"),
     "policies": ((list,), ["random", "oracle"], "a list of policies to score beside the rows"),
     "reference": ((str,), None, "the name of a row"),
     "recipe": ((str,), None, "the file of a frozen recipe"),
@@ -101,6 +103,11 @@ class StudyPlan:
         named = self.values["recipe"]
         return Path(named) if named is not None else Path("results") / f"recipe-{self.name}.json"
 
+    @property
+    def search(self) -> dict[str, Any]:
+        """Settings of the search by which rows act, as options of `grasp-eval` by name; none where all are usual."""
+        return {f"cem_{name}": value for name, value in self.values["cem"].items()}
+
     def dataset(self, task: str, size: str) -> Path:
         """Return the folder of a dataset, as `grasp-datagen` names it."""
         return Path(self.values["data"]) / f"{task.replace(':', '.')}-{size}"
@@ -139,6 +146,8 @@ def read_plan(path: Path) -> StudyPlan:
             parse_count(str(size))
         for policy in values["policies"]:
             checked_policy(policy)
+        plan = StudyPlan(path, rows, tuple(map(str, values["sizes"])), values)
+        CemOptions.from_json(plan.search)
     except (UserError, ValueError) as error:
         raise UserError(f"{path}: {error}") from None
     names = [row.name for row in rows]
@@ -147,7 +156,7 @@ def read_plan(path: Path) -> StudyPlan:
         raise UserError(f"{path}: two rows are called {twice!r}; give one of them a name of its own")
     if values["reference"] not in (None, *names):
         raise UserError(f"{path}: reference = {values['reference']!r}; expected a row: {', '.join(names)}")
-    return StudyPlan(path, rows, tuple(map(str, values["sizes"])), values)
+    return plan
 
 
 def _rows(entry: Any, values: Mapping[str, Any]) -> Iterator[Row]:

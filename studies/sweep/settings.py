@@ -13,6 +13,7 @@ from graspq.common.errors import UserError
 from graspq.common.machine import available_cores
 from graspq.common.options import MOST, flag, parse_count, setting
 from graspq.engine import EngineSettings
+from graspq.train.search_settings import CemOptions
 
 # Source of both grids: Quillen et al. 2018, section "Analyzing Stability".
 GRID: dict[str, Any] = {"learning_rate": (0.01, 0.001, 0.0001), "width": (32, 64), "discount": (0.9, 0.95)}
@@ -51,7 +52,7 @@ def parse_varied(text: str) -> Varied:
 
 
 @dataclass(frozen=True)
-class SweepSettings(EngineSettings):
+class SweepSettings(CemOptions, EngineSettings):
     """Settings of `grasp-sweep`; see each field's help."""
 
     preset: Literal["small", "paper"] = setting(

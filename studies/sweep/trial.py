@@ -15,7 +15,6 @@ from graspq.evaluate.records import Evaluation, finished_below
 from graspq.studies.sweep.commands import PRESET, CommandLine, training_options, training_script, words_for
 from graspq.studies.sweep.settings import GRASPS_PER_ROUND, STEPS_PER_ROUND, SweepSettings
 from graspq.train.run import Run, step_of
-from graspq.train.search_settings import CemSettings
 
 # Options of training by name, each with its value as a command line gives it.
 Options = tuple[tuple[str, str], ...]
@@ -120,13 +119,13 @@ class Trial:
         return None if of_a_run_that_is_gone else str(note.get("reason"))
 
     def _is_asked(self, summary: dict[str, Any]) -> bool:
-        """Return whether an evaluation is of the last step and on the sweep's scenes."""
+        """Return whether an evaluation is of the last step, and of the sweep's search on its scenes."""
         own = self.settings
         asked = {
             "checkpoint_step": own.steps, "split": own.split, "episodes": own.episodes, "seed": SCENES_SEED,
         }  # fmt: skip
-        usual = summary.get("cem") in (None, CemSettings().to_json())
-        return usual and all(summary.get(name) == value for name, value in asked.items())
+        searched = summary.get("cem") in (None, own.cem.to_json())
+        return searched and all(summary.get(name) == value for name, value in asked.items())
 
     def done(self) -> bool:
         """Return whether the score is there, or the note that there will be none."""
@@ -147,7 +146,7 @@ class Trial:
             rounds = (own.steps or 0) // STEPS_PER_ROUND
             words += ["--rounds", str(rounds), "--steps-per-round", str(STEPS_PER_ROUND)]
             words += [] if "grasps" in given else ["--grasps", str(GRASPS_PER_ROUND)]
-            words += ["--workers", self._workers, *self._objects]
+            words += ["--workers", self._workers, *self._objects, *own.cem.words()]
         else:
             words += ["--steps", str(own.steps)]
         return CommandLine(training_script(own.on_policy), tuple(words))
@@ -157,7 +156,7 @@ class Trial:
         own = self.settings
         words = [str(self.run_folder), "--split", own.split, "--episodes", str(own.episodes)]
         words += ["--seed", str(SCENES_SEED), "--workers", self._workers, "--device", own.device]
-        return CommandLine("grasp-eval", (*words, *self._objects))
+        return CommandLine("grasp-eval", (*words, *self._objects, *own.cem.words()))
 
     @property
     def _workers(self) -> str:

@@ -50,6 +50,19 @@ def test_the_cross_entropy_method_reaches_a_maximum_on_the_border_and_stays_insi
     torch.testing.assert_close(choice.action, torch.ones(1, 4), rtol=0, atol=0.02)
 
 
+def test_the_cross_entropy_method_returns_the_best_sample_of_the_last_iteration_where_asked() -> None:
+    asked: list[Tensor] = []
+
+    def falling(action: Tensor) -> Tensor:
+        asked.append(action)
+        return quadratic(action) - len(asked)  # so that the best of all is one of the first iteration
+
+    choice = cross_entropy_method(falling, cem_noise(seeded("tests/cem"), batch=2), SPACE, answer="last")
+    assert len(asked) == 3
+    assert torch.equal(choice.action, asked[-1][torch.arange(2), quadratic(asked[-1]).argmax(dim=1)])
+    assert torch.equal(choice.q, quadratic(asked[-1]).amax(1) - 3)
+
+
 def test_the_cross_entropy_method_returns_the_best_sample_it_has_met_where_asked() -> None:
     met: list[Tensor] = []
 

@@ -11,7 +11,7 @@ from graspq.train.estimators import ESTIMATORS
 from graspq.train.recipe import Recipe
 from graspq.train.settings import Preset, TrainSettings, complete
 
-# What the paper's text gives (P), and where it is silent its released code (C).
+# What the paper's released code gives (C), and where there is no code its text (P).
 COMMON = {
     "network": "paper",  # C: cnn_ia_v1; P, figure 3
     "batch_size": 32,  # C: get_data
@@ -43,7 +43,7 @@ OWN: dict[str, dict[str, Any]] = {
     "mc": HUBER | {"discount": None},  # P, footnote; C
     # C: 100,000 of 2 million steps; the advantage's Q is the trained network's, gradient and all; 32 episodes.
     "corr-mc": CORRECTED | {"lag_steps": 100, "anneal": 0.05, "judge": "online-gradient", "batch_of": "episodes"},
-    "ddpg": DOUBLE_Q | {"actor_rest": 0.0, "actor_rate": 1.0, "actor_every": 1},
+    "ddpg": DOUBLE_Q | {"discount": 1.0, "actor_rest": 0.0, "actor_rate": 1.0, "actor_every": 1},
     # Not the paper's: the loss of the code they were published with, and else their defaults.
     "nstep": DOUBLE_Q | {"candidates": 16, "n": 2},
     "td-lambda": DOUBLE_Q | {"candidates": 16, "trace_decay": 0.5},

@@ -25,7 +25,9 @@ class CorrMcSettings(CorrectionSettings, EpisodeSettings):
 
     discount: float = setting(0.8, help="Discount.", minimum=0, maximum=1)
     anneal: float = setting(
-        0.5, help="Part of the steps over which nu rises from 0 to 1; 0: all at once.", minimum=0, maximum=1
+        0.5,
+        help="Part of the steps over which nu rises from 0 to 1; 0: all at once; above 1: it does not get there.",
+        minimum=0,
     )
 
     def __post_init__(self) -> None:
@@ -48,7 +50,8 @@ def target(
     Source: Quillen et al. 2018, section "Corrected Monte Carlo Evaluation".
     Differs: 1. Q of an advantage is a constant of the loss; the released code lets gradient through it (`--judge
     online-gradient`, with `--preset paper`). 2. ν rises over half of the training; over a twentieth with `--preset
-    paper`, which is the released code's 100,000 of 2 million steps; the text says "during training". 3. A batch counts
+    paper`, which is the released code's 100,000 of 2 million steps (of other numbers: `--anneal` 100,000 / steps); the
+    text says "during training". 3. A batch counts
     transitions; in the released code 32 counts episodes (`--batch-of episodes`, with `--preset paper`). 4. The lagged
     network is copied every 50 steps, the paper's text for `dql`; every 100 in the released code, and with `--preset
     paper`. 5. The discount is 0.8, the best that was measured (0.9 with `--preset paper`).

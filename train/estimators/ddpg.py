@@ -37,8 +37,8 @@ def target(
     """Return r + γ Q_θ'(s', π_φ'(s')), both networks lagged copies; float [B, T]. See `targets.bootstrapped`.
 
     Source: Quillen et al. 2018, section "Deep Deterministic Policy Gradient".
-    Differs: 1. The released code has no lagged actor; the paper's text has one. 2. It leaves the discount at 1; here it
-    is the text's 0.9.
+    Differs: 1. The released code has no lagged actor; the paper's text has one. 2. It leaves the discount at 1 (with
+    `--preset paper`); here it is the text's 0.9.
     """
     image, step = batch.next_states
     action = pointed(networks.lagged["actor"](image, step), networks.specification.action).clamp(-1, 1)
@@ -113,7 +113,7 @@ row = Estimator(
     settings=DdpgSettings,
     target_value=TargetValue("bootstrapped", target, needs_next=True, needs_return=False),
     action_selection=ActorNetwork(),
-    paper=DdpgSettings(loss="huber", actor_rest=0.0, actor_rate=1.0, actor_every=1),
+    paper=DdpgSettings(loss="huber", discount=1.0, actor_rest=0.0, actor_rate=1.0, actor_every=1),
     parts={"q": q_network, "actor": state_network(lambda specification: specification.actions)},
     update=actor_critic,
 )

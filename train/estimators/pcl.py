@@ -103,12 +103,13 @@ def target(batch: Batch, networks: Networks, settings: PclSettings, random: torc
     Differs: the authors' code for grasping was not released. 1. The loss is the mean squared residual (`--loss` is no
     option). 2. A path is the rest of the episode (their configuration: 10 steps; `--preset paper`). 3. λ is tuned to a
     mean KL(π‖π') (`--penalty 3` in their configuration; `--preset paper`); Trust-PCL computes it from the policy's own
-    last episodes, of which there are none here. 4. π' is a copy every `--lag-steps` steps; theirs is a moving average.
-    5. The deviation is learned, between 0.1 and 1; theirs is fixed. 6. The mean lies within 1.25 times the box. 7. Both
-    policies run with the same running statistics, see `_share_statistics`. 8. Gradients of π are divided by λ, see
-    `path_consistency`. 9. The policy's rate is a tenth of V's (1 with `--preset paper`). 10. The step is in the state.
-    11. With `--path-steps`, V(s_{t+d}) is of the same pass as V(s_t). 12. A batch counts transitions (their 64 counts
-    episodes; `--batch-of episodes`, with `--preset paper`).
+    last episodes, of which there are none here. 4. π' is a copy every `--lag-steps` steps, as in their configuration;
+    in their code for other tasks it is a moving average. 5. The deviation is learned, between 0.1 and 1; theirs is
+    fixed. 6. The mean lies within 1.25 times the box. 7. Both policies run with the same running statistics, see
+    `_share_statistics`. 8. Residuals are not clipped (to ±1 in their configuration); gradients of π are divided by λ,
+    see `path_consistency`. 9. The policy's rate is a tenth of V's (1 with `--preset paper`). 10. The step is in the
+    state. 11. With `--path-steps`, V(s_{t+d}) is of the same pass as V(s_t). 12. A batch counts transitions (their 64
+    counts episodes; `--batch-of episodes`, with `--preset paper`).
     """
     return _value_and_target(batch, networks, settings)[1]
 

@@ -34,6 +34,21 @@ def test_an_on_policy_cell_trains_in_rounds_and_its_recipe_holds_them(plan: Call
     assert cell.deciding["online"]["rounds"] == 2 and cell.deciding["training"]["steps"] == 2000
 
 
+def test_the_search_of_a_plan_is_that_of_its_scores_and_part_of_the_recipe(plan: Callable[..., Any]) -> None:
+    _, (usual, *_) = plan()
+    _, (other, *_) = plan(("steps = 3", "steps = 3\ncem = {answer = 'last', views = 1}"))
+    words = other.evaluation_command().arguments
+    assert (
+        words[-4:] == ("--cem-answer", "last", "--cem-views", "1")
+        and "--cem-answer" not in other.training_command().arguments
+    )
+    assert "--cem-answer" not in usual.evaluation_command().arguments
+    assert usual.digest != other.digest and other.deciding["search"]["views"] == 1
+    _, (online, *_) = plan(("steps = 3", "steps = 2000\nsetting = 'on-policy'\ncem = {views = 1}"))
+    assert online.training_command().arguments[-2:] == ("--cem-views", "1")
+    assert online.deciding["search"]["views"] == online.deciding["online"]["cem_views"] == 1
+
+
 def test_an_option_that_a_row_does_not_have_is_refused_by_name(plan: Callable[..., Any]) -> None:
     _, (cell, *_) = plan(('"mc",', '{algo = "mc", nu = 1},'))
     with pytest.raises(UserError, match="mc-nu1: no option nu of training with mc"):

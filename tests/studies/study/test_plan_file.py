@@ -49,6 +49,9 @@ def test_a_row_with_the_papers_preset_has_the_papers_steps(tmp_path: Path) -> No
         ("rows = ['mc']\nsizes = ['10k']\nsetting = 'off'", "setting = 'off'; expected off-policy or on-policy"),
         ("rows = ['mc']\nsizes = ['10k']\nsplits = 'test'", "unknown key 'splits'"),
         ("rows = ['mc']\nsizes = ['10k']\npolicies = ['best']", "'best' is unknown"),
+        ("rows = ['mc']\nsizes = ['10k']\ncem = {size = 3}", "unknown setting 'cem_size'"),
+        ("rows = ['mc']\nsizes = ['10k']\ncem = {answer = 'first'}", "--cem-answer: 'first' is unknown"),
+        ("rows = ['mc']\nsizes = ['10k']\ncem = {views = 'one'}", "cem_views: 'one' is no value of it"),
         ("rows = ['mc', 'dql']\nsizes = ['10k']\nreference = 'pcl'", "reference = 'pcl'; expected a row: mc, dql"),
     ],
 )

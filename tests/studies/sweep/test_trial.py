@@ -10,6 +10,7 @@ import pytest
 from graspq.studies.sweep.grid import trials_of
 from graspq.studies.sweep.settings import SweepSettings
 from graspq.studies.sweep.trial import Trial
+from graspq.train.search_settings import CemSettings
 
 
 def test_a_trials_name_says_what_varies_and_leaves_out_what_it_does_not_use(settings: SweepSettings) -> None:
@@ -88,6 +89,17 @@ def test_an_evaluation_of_another_kind_does_not_count(changed: dict[str, Any], t
     write.trained(trials[0], 100)
     write.scored(trials[0], 3, **changed)
     assert trials[0].state().status == "to do"
+
+
+def test_a_score_counts_where_its_search_is_the_one_that_is_asked_for(trials: list[Trial], write: Any) -> None:
+    asked = dataclasses.replace(trials[0], settings=dataclasses.replace(trials[0].settings, cem_views=1))
+    write.trained(asked, 100)
+    usual = write.scored(asked, 3)
+    assert (trials[0].state().status, asked.state().status) == ("done", "to do")
+    assert asked.evaluation_command().arguments[-2:] == ("--cem-views", "1")
+    shutil.rmtree(usual)
+    write.scored(asked, 4, cem=CemSettings(views=1).to_json())
+    assert (trials[0].state().status, asked.state().status) == ("to do", "done")
 
 
 def test_an_evaluation_with_damaged_rows_does_not_count(trials: list[Trial], write: Any) -> None:
