@@ -212,15 +212,20 @@ class Committed:
                 content = self._waiting.pop(path)
                 self.files |= {path: content} if isinstance(content, bytes) else content
             return
-        for known in (self._waiting, self.files):
-            for path in [path for path in known if path == call.path or path.startswith(f"{call.path}/")]:
-                del known[path]
+        self._forget(call.path)
         if call.what == RENAME:
+            self._forget(call.other)  # until the folder is synced, the disk may have the old one or the new one
             what = self._disk.found(call.other)
             if isinstance(what, File):
                 self._waiting[call.other] = what.content
             elif what is not None:
                 self._waiting[call.other] = dict(files_of(what, f"{call.other}/"))
+
+    def _forget(self, gone: str) -> None:
+        """Drop what is known of a path, and of what lies below it."""
+        for known in (self._waiting, self.files):
+            for path in [path for path in known if path == gone or path.startswith(f"{gone}/")]:
+                del known[path]
 
     def missing(self, left: Folder) -> str | None:
         """Return what is not there; a file that has grown since may have lost what it has grown by."""

@@ -1,6 +1,8 @@
 """The short form of `make faults`: a few faults of most kinds, in at most a minute."""
 
+import random
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -8,7 +10,8 @@ from tests.faults.commands import difference, with_checkpoints_of
 from tests.faults.harness import GOOD, Kind, Work
 from tests.faults.kinds import KINDS
 from tests.faults.planted import PLANTED, source_with
-from tests.faults.system_calls import shim
+from tests.faults.power_loss import KEPT, LOST, WAYS, Committed, Disk
+from tests.faults.system_calls import CREATE, FSYNC, REMOVE, RENAME, WRITE, Call, shim
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +61,39 @@ def test_checkpoints_of_an_interrupted_run_are_compared_where_an_unbroken_run_ha
     unbroken = _run(4, 6, 8)
     found = difference(with_checkpoints_of(interrupted, unbroken), with_checkpoints_of(unbroken, interrupted))
     assert found is None if differs is None else differs in (found or "")
+
+
+def _commit(content: bytes) -> list[Call]:
+    """Return the calls that put a file in the place of another."""
+    return [
+        Call(CREATE, False, 0, "new", "", b""),
+        Call(WRITE, False, 0, "new", "", content),
+        Call(FSYNC, False, 0, "new", "", b""),
+        Call(RENAME, False, 0, "new", "file", b""),
+        Call(FSYNC, False, 0, "", "", b""),
+    ]
+
+
+def _replayed(calls: list[Call], start: Path) -> tuple[Disk, Committed]:
+    disk = Disk(start)
+    committed = Committed(disk)
+    for call in calls:
+        disk.do(call)
+        committed.see(call)
+    return disk, committed
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_committed_file_may_be_the_old_or_the_new_one_until_its_folder_is_synced(way: str, tmp_path: Path) -> None:
+    disk, committed = _replayed([*_commit(b"old"), *_commit(b"new")[:4]], tmp_path)
+    assert committed.missing(disk.left(way, random.Random(0))) is None
+    disk, committed = _replayed([*_commit(b"old"), *_commit(b"new")], tmp_path)
+    assert committed.files == {"file": b"new"}
+    assert committed.missing(disk.left(way, random.Random(0))) is None
+
+
+def test_a_committed_file_that_is_not_there_is_missing(tmp_path: Path) -> None:
+    _, committed = _replayed(_commit(b"old"), tmp_path)
+    assert committed.missing(Disk(tmp_path).left(LOST, random.Random(0))) == "file"
+    _, committed = _replayed([*_commit(b"old"), Call(REMOVE, False, 0, "file", "", b"")], tmp_path)
+    assert committed.missing(Disk(tmp_path).left(KEPT, random.Random(0))) is None
