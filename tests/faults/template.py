@@ -3,8 +3,10 @@
 Requests and answers are lines of JSON on the standard input and output that it is started with; see `Request`.
 """
 
+import atexit
 import contextlib
 import ctypes
+import gc
 import importlib
 import json
 import os
@@ -14,7 +16,9 @@ import select
 import signal
 import sys
 import tempfile
+import threading
 import time
+import traceback
 from typing import Any, NoReturn
 
 COMMANDS = {
@@ -28,9 +32,12 @@ COMMANDS = {
     "grasp-study": "graspq.studies.study.cli",
     "grasp-report": "graspq.report.cli",
 }
-# What the commands import late.
+# What the commands import late. An optimizer of PyTorch imports `torch._dynamo` when it is first made, and a table of
+# PyArrow pandas: that takes longer than the small work of a fault.
 LATE = (
-    "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop", "graspq.evaluate.evaluation",
+    "torch._dynamo", "pandas", "matplotlib.backends.backend_agg", "PIL.PngImagePlugin", "PIL.PpmImagePlugin",
+    "PIL.BmpImagePlugin", "PIL.GifImagePlugin", "PIL.JpegImagePlugin", "graspq.evaluate.job_units",
+    "graspq.datasets.verify", "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop", "graspq.evaluate.evaluation",
     "graspq.policies.of_run", "graspq.studies.online.rounds", "graspq.studies.sweep.workers",
     "graspq.studies.sweep.table", "graspq.studies.study.study", "graspq.studies.study.publishing",
     "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
@@ -48,6 +55,8 @@ def main() -> None:
     for name in (*COMMANDS.values(), *LATE):
         importlib.import_module(name)
     importlib.import_module("graspq.common.provenance").code_revision()
+    gc.collect()
+    gc.freeze()  # a child that collects garbage need not go through, and so copy, all that was imported
     print("ready", file=answers, flush=True)
     for line in requests:
         print(json.dumps(_answer(json.loads(line))), file=answers, flush=True)
@@ -94,10 +103,38 @@ def _be(request: Request) -> NoReturn:
         resource.setrlimit(getattr(resource, name), (limit, limit))
     if request["armed"] is not None:
         _arm(**request["armed"])
-    if program in COMMANDS:
-        sys.exit(importlib.import_module(COMMANDS[program]).main(arguments, prog_name=program))
-    runpy.run_path(program, run_name="__main__")
-    sys.exit(0)
+    status = 0
+    try:
+        if program in COMMANDS:
+            importlib.import_module(COMMANDS[program]).main(arguments, prog_name=program)
+        else:
+            runpy.run_path(program, run_name="__main__")
+    except SystemExit as ending:
+        status = _status(ending.code)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    _end(status)
+
+
+def _status(code: object) -> int:
+    """Return the exit status that Python makes of the value of a SystemExit."""
+    if code is None or isinstance(code, int):
+        return (code or 0) & 0xFF
+    print(code, file=sys.stderr)
+    return 1
+
+
+def _end(status: int) -> NoReturn:
+    """End as Python does: wait for threads, call what asked for it, flush; but do not take all modules apart.
+
+    That last step took a second, most of it to copy the pages of what was imported, and does nothing to files.
+    """
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
 
 
 def _arm(under: str, mode: int, at: int, error: int, log: str, calls: int) -> None:
