@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.faults.harness import Fault, Ran, Tried, Work
+from tests.faults.harness import Fault, NotHereError, Ran, Tried, Work
 from tests.faults.system_calls import (
     CHANGES,
     FSYNC,
@@ -68,7 +68,9 @@ class KilledByStrace:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return a few for each command; none in the short form."""
-        for scenario in scenarios(work, short, None) if shutil.which("strace") is not None else ():
+        if shutil.which("strace") is None:
+            raise NotHereError("no strace here")
+        for scenario in scenarios(work, short, None):
             unbroken = stage_of(work).unbroken(scenario)
             for name, calls in (("fsync", FSYNC), ("rename", RENAME)):
                 for number in few(range(1, unbroken.count(calls) + 1), 3):

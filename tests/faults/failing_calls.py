@@ -8,13 +8,14 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from tests.faults.crash_points import few, gone_on, stage_of
-from tests.faults.harness import Fault, Ran, Tried, Work
+from tests.faults.harness import Fault, NotHereError, Ran, Tried, Work
 from tests.faults.system_calls import (
     CREATE,
     FAIL,
@@ -120,9 +121,16 @@ def mounted(case: Path, *options: str) -> Iterator[None]:
         subprocess.run(["umount", "-l", str(case)], check=True, capture_output=True)
 
 
-def can_mount() -> bool:
-    """Return whether this process may mount."""
-    return os.geteuid() == 0 and shutil.which("mount") is not None
+def must_mount() -> None:
+    """Raise NotHereError unless this process may mount."""
+    mount = shutil.which("mount")
+    if os.geteuid() != 0 or mount is None:
+        raise NotHereError("needs root and mount")
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        ran = subprocess.run([mount, "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True)
+        if ran.returncode != 0:
+            raise NotHereError(f"mount: {ran.stderr.decode(errors='replace').strip()}")
+        subprocess.run(["umount", "-l", folder], check=True, capture_output=True)
 
 
 @dataclass
@@ -133,7 +141,8 @@ class FullDisk:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return some sizes for each command."""
-        for scenario in scenarios(work, short) if can_mount() else ():
+        must_mount()
+        for scenario in scenarios(work, short):
             for percent in (50,) if short else range(5, 100, 10):
                 yield Fault(self.name, scenario.command, f"{percent} % of the room")
 
@@ -167,7 +176,8 @@ class ReadOnly:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return one for each command; none in the short form."""
-        for scenario in scenarios(work, short, None) if can_mount() else ():
+        must_mount()
+        for scenario in scenarios(work, short, None):
             yield Fault(self.name, scenario.command, "whole working folder")
 
     def tried(self, fault: Fault, work: Work) -> Tried:

@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -96,13 +97,21 @@ class Ran:
         return Tried("detected", self.line)
 
 
+class NotHereError(Exception):
+    """A kind of fault cannot be tried on this machine; says why."""
+
+
 class Kind(Protocol):
     """A kind of fault."""
 
     name: str
 
     def faults(self, work: "Work", short: bool) -> Iterable[Fault]:
-        """Return all faults, or a few of each command for `make test`."""
+        """Return all faults, or a few of each command for `make test`.
+
+        Raises:
+            NotHereError: none can be tried on this machine.
+        """
 
     def tried(self, fault: Fault, work: "Work") -> Tried:
         """Try one; whatever it leaves in a copy of the work is thrown away."""
@@ -128,6 +137,13 @@ TRAINING = (
 MADE: dict[str, tuple[str, tuple[str, ...]]] = {
     "objects": ("objects", ("grasp-objects make procedural objects --train 6 --test 6 --validation 6",)),
     "dataset": ("data/regular-24", (f"{HERE / 'small_dataset.py'} 24 data/regular-24 objects",)),
+    "other": (
+        "other-24",
+        (
+            "grasp-objects make procedural other-objects --train 6 --test 6 --validation 6 --seed 5",
+            f"{HERE / 'small_dataset.py'} 24 other-24 other-objects",
+        ),
+    ),
     "run": ("runs/mc", (f"grasp-train --algo mc --shards data/regular-24 --out runs/mc --steps 8 {TRAINING}",)),
     "evaluation": (
         "scores",
@@ -376,15 +392,26 @@ def digest_of(folder: Path, but: Sequence[str] = ()) -> dict[str, str]:
 
 
 def code_digest(*files: Path) -> str:
-    """Return one SHA-256 of the product's code, of the harness and of the files of a kind."""
+    """Return one SHA-256 of the product's code and of files of the harness, with those that they name or import."""
     packages = [path.parent for path in ROOT.glob("*/__init__.py") if path.parent.name != "tests"]
     product = [path for folder in packages for path in folder.rglob("*") if path.suffix in (".py", ".html")]
-    names = ("harness.py", "template.py", "small_dataset.py", "system_calls.py", "shim.c", "commands.py")
-    shared = [HERE / name for name in names]
     whole = hashlib.sha256()
-    for path in sorted({*product, *shared, *files}):
+    for path in sorted({*product, *_with_what_they_use(HERE / "harness.py", HERE / "system_calls.py", *files)}):
         whole.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes() + b"\0")
     return whole.hexdigest()[:16]
+
+
+def _with_what_they_use(*files: Path) -> set[Path]:
+    """Return files of this folder, those that they import, and those that they start or load, at all removes."""
+    found, left = set[Path](), list(files)
+    while left:
+        path = left.pop()
+        if path not in found and path.exists():
+            found.add(path)
+            text = path.read_text()
+            named = [f"{module}.py" for module in re.findall(r"from tests\.faults\.(\w+) import", text)]
+            left += [HERE / name for name in (*named, *re.findall(r"[\"'](\w+\.(?:py|c))[\"']", text))]
+    return found
 
 
 @dataclass
@@ -423,10 +450,32 @@ class Log:
             file.write(f"\n{json.dumps(values)}\n")  # on a line of its own, whatever a kill has left there
 
 
+@dataclass
+class Results:
+    """What became of the faults of a kind.
+
+    Attributes:
+        kind: its name.
+        planned: how many faults it has.
+        tried: those that were tried, now or before.
+        why_not: why none can be tried on this machine; "" where they can.
+    """
+
+    kind: str
+    planned: int = 0
+    tried: list[tuple[Fault, Tried]] = field(default_factory=list)
+    why_not: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether all were tried."""
+        return not self.why_not and len(self.tried) == self.planned
+
+
 def try_kind(
     kind: Kind, work: Work, log: Log, code: str, short: bool, until: float, part: tuple[int, int] = (0, 1)
-) -> list[tuple[Fault, Tried]]:
-    """Try the faults of a kind that were not tried yet; return all that were tried.
+) -> Results:
+    """Try the faults of a kind that were not tried yet; return what became of all.
 
     Args:
         kind: the kind.
@@ -434,17 +483,21 @@ def try_kind(
         log: of what was tried before; gets the others.
         code: see `code_digest`.
         short: see `Kind.faults`.
-        until: when the clock (`time.monotonic`) says so, no other is begun.
+        until: when the clock (`time.monotonic`) says so, no other is begun; those of before are returned all the same.
         part: number and count of the parts that processes share them in.
     """
-    found = []
+    results = Results(kind.name)
     mine, parts = part
-    for number, fault in enumerate(kind.faults(work, short)):
-        if time.monotonic() > until:
-            break
-        if number % parts != mine:
-            continue
+    try:
+        faults = list(kind.faults(work, short))
+    except NotHereError as reason:
+        results.why_not = str(reason)
+        return results
+    for fault in faults[mine::parts]:
+        results.planned += 1
         if not log.knows(fault, code):
+            if time.monotonic() > until:
+                continue
             start = time.monotonic()
             try:
                 tried = kind.tried(fault, work)
@@ -453,25 +506,35 @@ def try_kind(
             log.add(fault, code, tried, time.monotonic() - start)
             if tried.outcome not in GOOD:
                 print(f"{fault.kind}, {fault.command}, {fault.name}: {tried.outcome}: {tried.said}", file=sys.stderr)
-        found.append((fault, log.tried[fault][1]))
-    return found
+        results.tried.append((fault, log.tried[fault][1]))
+    return results
 
 
-def rows_of(tried: Iterable[tuple[Fault, Tried]]) -> list[dict[str, Any]]:
-    """Return a row a kind and command: how often it was tried, and what became of it."""
-    rows: dict[tuple[str, str], dict[str, Any]] = {}
-    for fault, one in tried:
-        empty = {"fault": fault.kind, "command": fault.command, "tried": 0} | dict.fromkeys(OUTCOMES, 0)
-        row = rows.setdefault((fault.kind, fault.command), empty)
+def rows_of(results: Results) -> list[dict[str, Any]]:
+    """Return a row for each command: how often it was tried, and what became of it; one row where nothing was tried."""
+    empty = {"fault": results.kind, "command": "", "tried": 0} | dict.fromkeys(OUTCOMES, 0)
+    rows: dict[str, dict[str, Any]] = {}
+    for fault, one in results.tried:
+        row = rows.setdefault(fault.command, empty | {"command": fault.command})
         row["tried"] += one.cases
         row[one.outcome] += one.cases
-    return list(rows.values())
+    return list(rows.values()) or [empty | {"command": f"not tried: {results.why_not or 'no time was left'}"}]
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the rows and their sum as a Markdown table."""
     columns = ("fault", "command", "tried", *OUTCOMES)
-    kinds = len({row["fault"] for row in rows})
+    kinds = len({row["fault"] for row in rows if row["tried"]})
     total = [f"all ({kinds} kinds)", "", *(sum(row[name] for row in rows) for name in columns[2:])]
     lines = [*([row[name] for name in columns] for row in rows), total]
     return markdown(columns, [[str(cell) for cell in line] for line in lines])
+
+
+def sentence(results: Sequence[Results], day: str, code: str) -> str:
+    """Return in words whether all that was planned was tried, when and with which code."""
+    tried, planned = sum(len(one.tried) for one in results), sum(one.planned for one in results)
+    said = f"{day}, code {code}: {tried:,} of {planned:,} faults that are planned were tried"
+    left = [
+        f"{one.kind}: {one.why_not or f'{len(one.tried):,} of {one.planned:,}'}" for one in results if not one.whole
+    ]
+    return f"{said}." if not left else f"**Not whole.** {said}. Not or not all tried: {'; '.join(left)}."

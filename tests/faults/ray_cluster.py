@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from tests.faults.commands import Running, one_line
-from tests.faults.harness import Fault, Tried, Work
+from tests.faults.harness import Fault, NotHereError, Tried, Work
 from tests.faults.workers import COLLECT
 
 FAULTS = ("a node killed", "the head killed", "the object store full", "the command killed", "a Ray of its own")
@@ -17,14 +17,15 @@ _PATIENT = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "
 
 
 class Ray:
-    """Faults of a Ray cluster on this machine; none where Ray is not installed."""
+    """Faults of a Ray cluster on this machine."""
 
     name = "Ray"
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return each fault."""
-        there = importlib.util.find_spec("ray") is not None
-        for name in FAULTS if there and not short else ():
+        if importlib.util.find_spec("ray") is None:
+            raise NotHereError("Ray is not installed")
+        for name in () if short else FAULTS:
             yield Fault(self.name, "grasp-datagen", name)
 
     def tried(self, fault: Fault, work: Work) -> Tried:

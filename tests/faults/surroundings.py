@@ -2,12 +2,12 @@
 
 import os
 import shutil
-import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
 from tests.faults.commands import LINES, MAKING, STUDY, TRAIN, Line, one_line
-from tests.faults.harness import HERE, Fault, Tried, Work
+from tests.faults.harness import HERE, Fault, NotHereError, Tried, Work
+from tests.faults.system_calls import NO_COMPILER, compiled
 
 LOCALES = {
     "LANG=C": {"LANG": "C", "LC_ALL": "C"},
@@ -126,19 +126,23 @@ class Clock:
     name = "clock"
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
-        """Return each command with each clock; none where there is no C compiler."""
-        for line in () if short or shutil.which("cc") is None else LINES:
+        """Return each command with each clock."""
+        if self._library(work) is None:
+            raise NotHereError(NO_COMPILER)
+        for line in () if short else LINES:
             for how in CLOCKS:
                 yield Fault(self.name, line.name, how)
 
     def tried(self, fault: Fault, work: Work) -> Tried:
         """Run the command with that clock and compare."""
-        shim = work.folder / "clock.so"
-        if not shim.exists():
-            subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", shim, HERE / "clock.c", "-ldl"], check=True)
         line = _line(fault)
         with line.case(work) as case:
-            return _run(line, case, work, {"LD_PRELOAD": str(shim), "GRASPQ_CLOCK": fault.name})
+            return _run(line, case, work, {"LD_PRELOAD": str(self._library(work)), "GRASPQ_CLOCK": fault.name})
+
+    def _library(self, work: Work) -> Path | None:
+        with work.alone():
+            made = work.folder / "clock.so"
+            return made if made.exists() else compiled(HERE / "clock.c", work.folder)
 
 
 def _line(fault: Fault) -> Line:

@@ -6,13 +6,12 @@ import os
 import shutil
 import struct
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.faults.harness import HERE, PLAN, TRAINING, Ran, Work, digest_of
+from tests.faults.harness import HERE, PLAN, TRAINING, NotHereError, Ran, Work, digest_of
 
 # As in shim.c.
 OFF, NOTE, KILL, KILL_HALF, FAIL, FAIL_ON, FAIL_FILE = range(7)
@@ -96,23 +95,27 @@ MAKES, TRAINS = "grasp-objects make", "grasp-train"  # of which `make test` trie
 
 
 def scenarios(work: Work, short: bool, command: str | None = MAKES) -> Sequence[Scenario]:
-    """Return the scenarios that are tried: all, one or none for `make test`, none where system calls cannot be met."""
+    """Return the scenarios that are tried: all, one or none for `make test`."""
     if work.shim is None:
-        print(NO_COMPILER, file=sys.stderr)
-        return ()
+        raise NotHereError(NO_COMPILER)
     return [scenario for scenario in SCENARIOS if not short or scenario.command == command]
 
 
-def shim(folder: Path) -> Path | None:
-    """Return `shim.c` compiled; None without a compiler."""
+def compiled(source: Path, folder: Path) -> Path | None:
+    """Return a C file as a library to preload; None without a compiler."""
     compiler = next(filter(None, map(shutil.which, ("gcc", "cc"))), None)
     if compiler is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    library, made = folder / "shim.so", folder / f"shim-{os.getpid()}.so"
-    subprocess.run([compiler, "-O1", "-shared", "-fPIC", "-o", made, HERE / "shim.c", "-ldl", "-lpthread"], check=True)
+    library, made = folder / f"{source.stem}.so", folder / f"{source.stem}-{os.getpid()}.so"
+    subprocess.run([compiler, "-O1", "-shared", "-fPIC", "-o", made, source, "-ldl", "-lpthread"], check=True)
     made.replace(library)  # in one step: another process may be at the same
     return library
+
+
+def shim(folder: Path) -> Path | None:
+    """Return `shim.c` compiled; None without a compiler."""
+    return compiled(HERE / "shim.c", folder)
 
 
 def armed(

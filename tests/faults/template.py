@@ -37,10 +37,10 @@ COMMANDS = {
 LATE = (
     "torch._dynamo", "pandas", "matplotlib.backends.backend_agg", "PIL.PngImagePlugin", "PIL.PpmImagePlugin",
     "PIL.BmpImagePlugin", "PIL.GifImagePlugin", "PIL.JpegImagePlugin", "graspq.evaluate.job_units",
-    "graspq.datasets.verify", "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop", "graspq.evaluate.evaluation",
-    "graspq.policies.of_run", "graspq.studies.online.rounds", "graspq.studies.sweep.workers",
-    "graspq.studies.sweep.table", "graspq.studies.study.study", "graspq.studies.study.publishing",
-    "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
+    "graspq.datasets.verify", "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop",
+    "graspq.evaluate.evaluation", "graspq.policies.of_run", "graspq.studies.online.rounds",
+    "graspq.studies.sweep.workers", "graspq.studies.sweep.table", "graspq.studies.study.study",
+    "graspq.studies.study.publishing", "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
 )  # fmt: skip
 Request = dict[str, Any]  # argv, cwd, env, stdin, stdout, stderr (paths), seconds, limits (name -> bytes), armed
 

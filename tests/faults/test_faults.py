@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.commands import difference, with_checkpoints_of
-from tests.faults.harness import GOOD, Kind, Work
+from tests.faults.harness import GOOD, Kind, NotHereError, Work
 from tests.faults.kinds import KINDS
 from tests.faults.planted import PLANTED, source_with
 from tests.faults.power_loss import KEPT, LOST, WAYS, Committed, Disk
@@ -23,7 +23,11 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Work]:
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_nothing_is_lost_or_silently_wrong(kind: Kind, work: Work) -> None:
-    for fault in kind.faults(work, short=True):
+    try:
+        faults = list(kind.faults(work, short=True))
+    except NotHereError as reason:
+        pytest.skip(str(reason))
+    for fault in faults:
         tried = kind.tried(fault, work)
         assert tried.outcome in GOOD, (fault, tried)
 
