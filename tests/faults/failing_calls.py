@@ -154,7 +154,7 @@ class FullDisk:
         with stage.begun(scenario) as case:
             ran = work.forked(scenario.argv, case)
             needed = _pages(case) - before
-        room = before + int(fault.name.split()[0]) * needed // 100
+        room = max(before + int(fault.name.split()[0]) * needed // 100, 1)  # a size of 0 would be no bound
         with work.copy() as case, mounted(case, "-t", "tmpfs", "-o", f"size={4 * room}k", "tmpfs"):
             shutil.copytree(start, case, symlinks=True, dirs_exist_ok=True)
             ran = work.forked(scenario.argv, case)

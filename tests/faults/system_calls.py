@@ -193,12 +193,13 @@ class Stage:
 
     def begun(self, scenario: Scenario) -> "Begun":
         """Return a context of a fresh working folder."""
+        self.unbroken(scenario)  # now, in a folder of the same path: that stands in some files
         return Begun(self._work, self.start(scenario))
 
     def unbroken(self, scenario: Scenario) -> Unbroken:
         """Return what comes of a scenario where nothing goes wrong."""
         if scenario.command not in self._unbroken:
-            with self.begun(scenario) as case:
+            with Begun(self._work, self.start(scenario)) as case:
                 log = case.with_name(f"{case.name}-calls")
                 try:
                     ran = self._work.forked(
