@@ -208,10 +208,10 @@ class Limits:
     def tried(self, fault: Fault, work: Work) -> Tried:
         """Run the command with the limit, then without."""
         stage, scenario = stage_of(work), OF_COMMAND[fault.command]
-        value = int(fault.name)
-        if self.limit == "RLIMIT_AS":
-            value = value * 2**20 + work.address_space
+        value, memory = int(fault.name), self.limit == "RLIMIT_AS"
+        if memory:
+            value = value * 2**20 + work.address_space(lean=True)
         with stage.begun(scenario) as case:
-            ran = work.forked(scenario.argv, case, limits={self.limit: value})
+            ran = work.forked(scenario.argv, case, limits={self.limit: value}, lean=memory)
             again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
             return judged(ran, scenario, stage, case, again)

@@ -187,7 +187,7 @@ class Work:
     def __init__(self, folder: Path, source: Path | None = None, shim: Path | None = None) -> None:
         self.folder, self.inputs, self.source = folder.absolute(), folder.absolute() / "inputs", source
         self.shim = shim
-        self._template: subprocess.Popen[str] | None = None
+        self._templates: dict[bool, subprocess.Popen[str]] = {}  # lean or not
         self._own = self.folder / "cases" / str(os.getpid())  # two may work here at once
         self.inputs.mkdir(parents=True, exist_ok=True)
         self._lock = filelock.FileLock(self.folder / "lock")
@@ -200,12 +200,12 @@ class Work:
         shutil.rmtree(self._own, ignore_errors=True)
 
     def rest(self) -> None:
-        """End the process that commands are forked from; the next starts another."""
-        if self._template is not None:
-            assert self._template.stdin is not None
-            self._template.stdin.close()
-            self._template.wait()
-            self._template = None
+        """End the processes that commands are forked from; the next starts another."""
+        for template in self._templates.values():
+            assert template.stdin is not None
+            template.stdin.close()
+            template.wait()
+        self._templates.clear()
 
     def made(self, name: str) -> Path:
         """Return an input, made with all that it needs if it is not there yet; to read only."""
@@ -321,6 +321,7 @@ class Work:
         limits: Mapping[str, int] | None = None,
         armed: Mapping[str, Any] | None = None,
         stdin: str = os.devnull,
+        lean: bool = False,
     ) -> Ran:
         """Run a command in a child, forked for it alone, of a process that has imported all commands: see `template`.
 
@@ -332,8 +333,9 @@ class Work:
             limits: `RLIMIT_...` -> soft and hard limit.
             armed: what `shim.c` does to its system calls.
             stdin: path of its standard input.
+            lean: of a process that has not imported what the commands import late.
         """
-        template = self._started()
+        template = self._started(lean)
         assert template.stdin is not None and template.stdout is not None
         said = self._own / "said"
         said.mkdir(parents=True, exist_ok=True)
@@ -347,10 +349,9 @@ class Work:
         out, err = ((said / name).read_text(errors="replace") for name in ("out", "err"))
         return Ran(stdout=out, stderr=err, **answer)
 
-    @property
-    def address_space(self) -> int:
-        """Bytes of address space that a forked command has when it begins."""
-        sizes = Path(f"/proc/{self._started().pid}/statm").read_text().split()
+    def address_space(self, lean: bool = False) -> int:
+        """Return how many bytes of address space a forked command has when it begins."""
+        sizes = Path(f"/proc/{self._started(lean).pid}/statm").read_text().split()
         return int(sizes[0]) * os.sysconf("SC_PAGE_SIZE")
 
     def environment(self, changed: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -362,20 +363,21 @@ class Work:
             fixed["PYTHONPATH"] = str(self.source)
         return {**os.environ, **fixed, **(changed or {})}
 
-    def _started(self) -> "subprocess.Popen[str]":
-        if self._template is None or self._template.poll() is not None:
+    def _started(self, lean: bool = False) -> "subprocess.Popen[str]":
+        template = self._templates.get(lean)
+        if template is None or template.poll() is not None:
             shim = {} if self.shim is None else {"LD_PRELOAD": str(self.shim)}
-            self._template = subprocess.Popen(
-                [sys.executable, HERE / "template.py"],
+            template = self._templates[lean] = subprocess.Popen(
+                [sys.executable, HERE / "template.py", *(["lean"] if lean else [])],
                 env=self.environment(shim),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
             )
-            assert self._template.stdout is not None
-            if self._template.stdout.readline() != "ready\n":
+            assert template.stdout is not None
+            if template.stdout.readline() != "ready\n":
                 raise RuntimeError("the template process did not start")
-        return self._template
+        return template
 
 
 def digest_of(folder: Path, but: Sequence[str] = ()) -> dict[str, str]:

@@ -1,5 +1,7 @@
 """A process that has imported every command and forks one for each request: a fault does not pay for Python's start.
 
+Started with `lean`, it leaves the largest of what they import late to the commands, which then ask for that memory.
+
 Requests and answers are lines of JSON on the standard input and output that it is started with; see `Request`.
 """
 
@@ -32,15 +34,19 @@ COMMANDS = {
     "grasp-study": "graspq.studies.study.cli",
     "grasp-report": "graspq.report.cli",
 }
-# What the commands import late. An optimizer of PyTorch imports `torch._dynamo` when it is first made, and a table of
-# PyArrow pandas: that takes longer than the small work of a fault.
+# What the commands import late.
 LATE = (
+    "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop", "graspq.evaluate.evaluation",
+    "graspq.policies.of_run", "graspq.studies.online.rounds", "graspq.studies.sweep.workers",
+    "graspq.studies.sweep.table", "graspq.studies.study.study", "graspq.studies.study.publishing",
+    "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
+)  # fmt: skip
+# The same, not when lean. An optimizer of PyTorch imports `torch._dynamo` when it is first made, and a table of PyArrow
+# pandas: that takes longer than the small work of a fault.
+HEAVY = (
     "torch._dynamo", "pandas", "matplotlib.backends.backend_agg", "PIL.PngImagePlugin", "PIL.PpmImagePlugin",
     "PIL.BmpImagePlugin", "PIL.GifImagePlugin", "PIL.JpegImagePlugin", "graspq.evaluate.job_units",
-    "graspq.datasets.verify", "graspq.objects.procedural", "graspq.datagen.making", "graspq.train.loop",
-    "graspq.evaluate.evaluation", "graspq.policies.of_run", "graspq.studies.online.rounds",
-    "graspq.studies.sweep.workers", "graspq.studies.sweep.table", "graspq.studies.study.study",
-    "graspq.studies.study.publishing", "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
+    "graspq.datasets.verify",
 )  # fmt: skip
 Request = dict[str, Any]  # argv, cwd, env, stdin, stdout, stderr (paths), seconds, limits (name -> bytes), armed
 
@@ -52,7 +58,7 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     os.dup2(nothing, 0)
     os.dup2(nothing, 1)
-    for name in (*COMMANDS.values(), *LATE):
+    for name in (*COMMANDS.values(), *LATE, *(() if sys.argv[1:] == ["lean"] else HEAVY)):
         importlib.import_module(name)
     importlib.import_module("graspq.common.provenance").code_revision()
     gc.collect()
