@@ -74,6 +74,8 @@ class ShardEntry:
         expected = {steps_file(self.name), episodes_file(self.name)}
         if SHARD_NAME.fullmatch(self.name) is None or set(self.files) != expected or set(self.sizes) != expected:
             raise ValueError(f"shard {self.name!r}: expected the files {sorted(expected)}")
+        if not all(isinstance(digest, str) for digest in self.files.values()):
+            raise ValueError(f"shard {self.name}: expected a SHA-256 for each file, got {self.files}")
         counts = (self.first_block, self.blocks, self.episodes, self.rows, self.successes, *self.sizes.values())
         if not all(type(count) is int and 0 <= count <= MOST for count in counts):
             raise ValueError(f"shard {self.name}: expected whole numbers of 0 to {MOST:.0e}, got {counts}")

@@ -308,6 +308,11 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
             "files of root": manifest("files", {"/etc/passwd": "0" * 64}),
             "files a list": manifest("files", ["README.md"]),
             "shard ../": manifest("shards.0.name", "../../secret"),
+            "shard's digests lists": _json(
+                f"{DATA}/manifest.json",
+                _signed_manifest,
+                lambda values: values["shards"][0].update(files={name: [1] for name in values["shards"][0]["files"]}),
+            ),
             "shard's files elsewhere": manifest("shards.0.files", {"../secret.parquet": "0" * 64}),
             "blocks of 10^18": manifest("shards.0.blocks", 10**18),
             "blocks of 10^9": manifest("shards.0.blocks", 10**9),
@@ -432,6 +437,13 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
         {
             "files ../": state("files", {"../../config.json": "0" * 64}),
             "files a list": state("files", ["q.safetensors"]),
+            "files without one": _json(
+                f"{RUN}/checkpoints/step-00000008/state.json",
+                _signed_state,
+                lambda values: values.update(
+                    files={name: digest for name, digest in values["files"].items() if "kept" not in name}
+                ),
+            ),
             "step a word": state("step", "8"),
             "step 10^18": state("step", 10**18),
             "parts of numbers": state("parts", [1, 2]),
