@@ -272,6 +272,10 @@ def _check_kinds(manifest: Manifest) -> None:
         "a name of the task": isinstance(task, dict) and isinstance(task.get("name"), str),
         "max_steps of 1 to 10,000": isinstance(task, dict) and _whole(task.get("max_steps"), 1, 10_000),
         "a block_size of 1 to 100,000": isinstance(settings, dict) and _whole(settings.get("block_size"), 1, 100_000),
+        "no blocks_per_shard, or 0 to 100,000": isinstance(settings, dict)
+        and _whole(settings.get("blocks_per_shard", 0), 0, 100_000),
+        "a name and a sha256 of the object_set": isinstance(manifest.object_set, dict)
+        and all(isinstance(manifest.object_set.get(name), str) for name in ("name", "sha256")),
         f"an image_shape of three, each 1 to {LARGEST_IMAGE}": len(shape) == 3
         and all(_whole(size, 1, LARGEST_IMAGE) for size in shape),
         "a discount of 0 to 1": isinstance(manifest.discount, int | float) and 0 <= manifest.discount <= 1,

@@ -342,6 +342,8 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
             "task of 10^18 steps": manifest("task.max_steps", 10**18),
             "settings a word": manifest("settings", "fast"),
             "object set a word": manifest("object_set", "own"),
+            "object set without a name": manifest("object_set", {"sha256": "0" * 64}),
+            "blocks of a shard a list": manifest("settings.blocks_per_shard", [2]),
             "phi range of one": manifest("phi_range", [1]),
             "format a list": manifest("format_version", [2]),
             "format 10^18": manifest("format_version", 10**18),
@@ -517,6 +519,9 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
             "files a list": score("files", ["episodes.jsonl"]),
             "object set a word": score("object_set", "own"),
             "versions a list": score("versions", []),
+            "ends a list": score("ends", [0]),
+            "checkpoint a list": score("checkpoint_step", [8]),
+            "digest of the object set a number": score("object_set.sha256", 5),
         },
     ),
     "table of a sweep": (
