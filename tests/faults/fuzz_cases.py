@@ -221,11 +221,11 @@ def runs(draw: Callable[[Any], Any]) -> None:
                     path.write_text(with_checksum(value, indent=2))
                 except ValueError:
                     write_json(path, value)
-        COUNTS["opened"] += 1
         if path != score and path.name != "metrics.jsonl":
             load(RUN)
         else:
             render(gather([Path("scores"), Path("runs")], None))
+        COUNTS["opened"] += 1
     finally:
         path.write_bytes(original)
 
@@ -329,9 +329,9 @@ def command_lines(draw: Callable[[Any], Any]) -> None:
     with command.make_context(name, list(words), parent=context) as made:
         settings = _settings_of(command)
         if settings is not None:
-            COUNTS["opened"] += 1
             built = settings(**{key: value for key, value in made.params.items() if value is not ...})
             built.to_json()
+            COUNTS["opened"] += 1
         elif name == "grasp-train":
             from graspq.train.settings import complete
 
@@ -386,7 +386,9 @@ def main() -> None:
             COUNTS["refused"] += 1
 
     tried()
-    print(f"{COUNTS['cases']} cases, {COUNTS['refused']} refused")
+    print(f"{COUNTS['cases']} cases, {COUNTS['refused']} refused, {COUNTS['opened']} opened")
+    if not COUNTS["opened"]:
+        sys.exit("no case got as far as to be opened: these are no cases of what reads the file")
 
 
 if __name__ == "__main__":

@@ -81,9 +81,15 @@ class Ran:
             return Tried("hung", self.line)
         if self.traceback:
             return Tried("traceback", self.line)
-        if self.rc < 0 and self.rc != -signal.SIGKILL:
+        if self.rc < 0:
             return Tried("traceback", f"ended by {signal.Signals(-self.rc).name}: {self.line}")
         return None
+
+    @property
+    def one_line(self) -> bool:
+        """Whether it refused in one line, its last: a mistake of the user, or a failure of the machine."""
+        lines = [line for line in self.stderr.splitlines() if line.startswith("error: ") or line.endswith("--help)")]
+        return self.rc in (2, 74) and len(lines) == 1 and lines[0].strip() == self.line
 
     def refused(self, *named: str) -> Tried:
         """Judge a command that had to refuse: one line, which names one of `named` where any are given."""
@@ -92,6 +98,8 @@ class Ran:
             return broken
         if self.rc == 0:
             return Tried("silently wrong", f"exit status 0: {self.line}")
+        if not self.one_line:
+            return Tried("silently wrong", f"exit status {self.rc}, not one line: {self.stderr[-300:]}")
         if named and not any(name in self.stderr for name in named):
             return Tried("silently wrong", f"names none of {', '.join(named)}: {self.line}")
         return Tried("detected", self.line)
@@ -170,7 +178,12 @@ MADE: dict[str, tuple[str, tuple[str, ...]]] = {
             "--out runs/online",
         ),
     ),
+    "report": ("report.html", ("grasp-report runs/mc scores --out report.html",)),
 }
+NEEDS = {
+    "dataset": ("objects",), "run": ("dataset",), "evaluation": ("run",), "online": ("run",), "report": ("evaluation",),
+    "sweep": ("dataset",), "study": ("dataset",), "collection": ("objects",),
+}  # fmt: skip
 BESIDE = ("plan.toml", "recipe.json", "results", "page.md")  # of the study
 
 
@@ -180,6 +193,7 @@ class Work:
     Attributes:
         folder: everything is below it.
         inputs: the inputs; read only.
+        temporary: folder for temporary files of commands.
         source: folder that `graspq` is imported from in the place of this tree; see `planted`.
         shim: `shim.c`, compiled; None where there is no compiler.
     """
@@ -189,7 +203,9 @@ class Work:
         self.shim = shim
         self._templates: dict[bool, subprocess.Popen[str]] = {}  # lean or not
         self._own = self.folder / "cases" / str(os.getpid())  # two may work here at once
+        self.temporary = self._own / "temporary"
         self.inputs.mkdir(parents=True, exist_ok=True)
+        _remove_forsaken(self.folder / "cases")
         self._lock = filelock.FileLock(self.folder / "lock")
 
     def __enter__(self) -> "Work":
@@ -218,10 +234,8 @@ class Work:
 
     def _made(self, name: str) -> Path:
         note = self.inputs / f".{name}-made"
-        order = list(MADE)
         if not note.exists():
-            needs = {"dataset": ["objects"], "run": ["dataset"], "evaluation": ["run"], "online": ["run"]}
-            for other in needs.get(name, order[:2] if name in ("sweep", "study") else []):
+            for other in NEEDS.get(name, ()):
                 self.made(other)
             if name == "study":
                 (self.inputs / "plan.toml").write_text(PLAN)
@@ -262,6 +276,12 @@ class Work:
             yield case
         finally:
             shutil.rmtree(case, ignore_errors=True)
+            shutil.rmtree(self.temporary, ignore_errors=True)
+
+    def left_over(self, case: Path) -> str | None:
+        """Return a temporary file or folder that a command has left in a case or in the folder for such."""
+        found = [*case.rglob(".tmp-*"), *self.temporary.glob("graspq-*")]
+        return next((path.name for path in found), None)
 
     def run(
         self,
@@ -356,9 +376,8 @@ class Work:
 
     def environment(self, changed: Mapping[str, str] | None = None) -> dict[str, str]:
         """Return the variables of a command: one thread, a temporary folder of the harness, the code of `source`."""
-        temporary = self.folder / "temporary"
-        temporary.mkdir(exist_ok=True)
-        fixed = {"OMP_NUM_THREADS": "1", "TMPDIR": str(temporary), "PYTHONUNBUFFERED": "1"}
+        self.temporary.mkdir(parents=True, exist_ok=True)
+        fixed = {"OMP_NUM_THREADS": "1", "TMPDIR": str(self.temporary), "PYTHONUNBUFFERED": "1"}
         if self.source is not None:
             fixed["PYTHONPATH"] = str(self.source)
         return {**os.environ, **fixed, **(changed or {})}
@@ -378,6 +397,65 @@ class Work:
             if template.stdout.readline() != "ready\n":
                 raise RuntimeError("the template process did not start")
         return template
+
+
+def _remove_forsaken(cases: Path) -> None:
+    """Remove cases of processes that were killed, and what was mounted in them."""
+    for folder in cases.glob("[0-9]*"):
+        if not Path("/proc", folder.name).exists():
+            for line in Path("/proc/mounts").read_text().splitlines():
+                place = line.split()[1].encode().decode("unicode_escape")
+                if place.startswith(f"{folder}/"):
+                    subprocess.run(["umount", "-l", place], capture_output=True)
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+# Work that a command commits for good, file by file: no later start may do it again.
+_COMMITTED = re.compile(r"(^|.*/)((shards|episodes)/[^/]+\.parquet|checkpoints/step-\d+/[^/]+|eval\.json)$")
+
+
+class CommittedWork:
+    """The work in a folder that is whole as in an unbroken run, which the next start must keep, not do again."""
+
+    def __init__(self, folder: Path, unbroken: Mapping[str, str]) -> None:
+        """Take note of it.
+
+        Args:
+            folder: where a command was broken off.
+            unbroken: path in it -> SHA-256 of the file that an unbroken run leaves there.
+        """
+        self._folder = folder
+        named = [name for name in unbroken if _COMMITTED.match(name) and (folder / name).is_file()]
+        whole = {name for name in named if hashlib.sha256((folder / name).read_bytes()).hexdigest() == unbroken[name]}
+        self._marks = {name: self._mark(name) for name in whole if self._is_committed(name, whole, unbroken)}
+
+    @property
+    def names(self) -> set[str]:
+        """Paths of the files that must be kept."""
+        return set(self._marks)
+
+    def _is_committed(self, name: str, whole: set[str], unbroken: Mapping[str, str]) -> bool:
+        """Return whether all that counts with a file is whole: a checkpoint's other files, a shard's entry."""
+        path = self._folder / name
+        if path.name == "eval.json":
+            return True
+        if path.parent.parent.name == "checkpoints":
+            return all(other in whole for other in unbroken if other.startswith(f"{Path(name).parent}/"))
+        manifest = path.parent.parent / "manifest.json"
+        return manifest.is_file() and f'"{path.parent.name}/{path.name}"' in manifest.read_text(errors="replace")
+
+    def _mark(self, name: str) -> tuple[int, int] | None:
+        """Return what a file that is written anew, even with the same bytes, does not share with the old one."""
+        try:
+            found = (self._folder / name).stat()
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns
+
+    def lost(self) -> Tried | None:
+        """Return what was done again or is gone."""
+        gone = next((name for name, mark in self._marks.items() if self._mark(name) != mark), None)
+        return None if gone is None else Tried("lost", f"{gone}: was whole, and was made again or is gone")
 
 
 def digest_of(folder: Path, but: Sequence[str] = ()) -> dict[str, str]:

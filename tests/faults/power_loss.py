@@ -269,7 +269,7 @@ class PowerLoss:
                 gone = not_there(case, stage, scenario)
                 if gone is not None:
                     return Tried("lost", f"{gone}: not there after the command had ended well")
-            return gone_on(work.forked(scenario.argv, case), scenario, case, stage)
+            return gone_on(scenario, case, work)
 
 
 def not_there(case: Path, stage: Stage, scenario: Scenario) -> str | None:

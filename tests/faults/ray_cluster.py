@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from tests.faults.commands import Running, one_line
+from tests.faults.commands import Running
 from tests.faults.harness import Fault, NotHereError, Tried, Work
 from tests.faults.workers import COLLECT
 
@@ -53,7 +53,7 @@ class Ray:
             broken = ended.broken()
             if broken is not None:
                 return broken
-            if ended.rc not in (0, 1, -9) and not one_line(ended):
+            if ended.rc not in (0, 1, -9) and not ended.one_line:
                 return Tried("lost", f"exit status {ended.rc}: {ended.line}")
             after = COLLECT.goes_on(case, work)
             said = ended.rc not in (0, -9)

@@ -80,7 +80,11 @@ static int met(int op, const char *name) {
     if (armed.mode == KILL && number == armed.at) die();
     if (armed.mode == KILL_HALF && number == armed.at) { if (op == WRITE) return 2; die(); }
     if (armed.mode == FAIL_FILE && number == armed.at) strcpy(bad, name);
-    if ((armed.mode == FAIL && number == armed.at) || (armed.mode == FAIL_ON && number >= armed.at) || (armed.mode == FAIL_FILE && bad[0] && !strcmp(bad, name))) { errno = armed.error; return 1; }
+    if ((armed.mode == FAIL && number == armed.at) || (armed.mode == FAIL_ON && number >= armed.at) || (armed.mode == FAIL_FILE && bad[0] && !strcmp(bad, name))) {
+        if (armed.log >= 0 && syscall(SYS_write, armed.log, "x", 1) < 0) abort(); /* it has failed: see failing_calls.py */
+        errno = armed.error;
+        return 1;
+    }
     return 0;
 }
 

@@ -89,4 +89,4 @@ class Suspended:
             broken = ended.broken()
             if broken is not None or ended.rc != 0:
                 return broken or Tried("lost", ended.line)
-            return line.fits(case, work)
+            return line.fits(case, work, ended)

@@ -3,9 +3,10 @@
 import os
 import shutil
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
-from tests.faults.commands import LINES, MAKING, STUDY, TRAIN, Line, one_line
+from tests.faults.commands import LINES, MAKING, STUDY, TRAIN, Line
 from tests.faults.harness import HERE, Fault, NotHereError, Tried, Work
 from tests.faults.system_calls import NO_COMPILER, compiled
 
@@ -105,7 +106,7 @@ def _elsewhere(name: str, line: Line, case: Path, work: Work) -> Tried:
         if ran.rc != 0:
             left = list((case / "real").iterdir())
             return Tried("lost", f"left {left[0]}") if left else Tried("detected", ran.line)
-        return line.fits(case, work) if result.is_symlink() else Tried("lost", "the link was replaced")
+        return line.fits(case, work, ran) if result.is_symlink() else Tried("lost", "the link was replaced")
     long = case / ("t" * 200)
     long.mkdir()
     return _run(line, case, work, {"TMPDIR": str(long)})
@@ -114,10 +115,10 @@ def _elsewhere(name: str, line: Line, case: Path, work: Work) -> Tried:
 def _named(line: Line, folder: Path) -> Line:
     """Return the command with its paths named from another working folder."""
     inside = Path("..") / folder if not folder.is_absolute() else folder
-    paths = {"objects", "data/regular-24", "runs/mc", "runs/online", "scores", "sweep", "study", "plan.toml", "runs"}
+    paths = {"objects", "data/regular-24", "runs/mc", "runs/online", "scores", "sweep", "study", "plan.toml"}
     paths |= {"report.html", "results", "page.md"}
     words = [str(inside / word) if word in paths else word for word in line.words[1:]]
-    return Line((line.words[0], *words), line.needs, line.result, line.made)
+    return replace(line, words=(line.words[0], *words))
 
 
 class Clock:
@@ -164,5 +165,5 @@ def _run(line: Line, cwd: Path, work: Work, env: dict[str, str] | None = None, i
     if broken is not None:
         return broken
     if ran.rc != 0:
-        return Tried("detected" if one_line(ran) else "lost", ran.line)
-    return line.fits(inside if inside is not None else cwd, work)
+        return Tried("detected" if ran.one_line else "lost", ran.line)
+    return line.fits(inside if inside is not None else cwd, work, ran)

@@ -2,12 +2,13 @@
 
 import random
 from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
 
-from tests.faults.commands import difference, with_checkpoints_of
-from tests.faults.harness import GOOD, Kind, NotHereError, Work
+from tests.faults.commands import difference, rows_differ, with_checkpoints_of
+from tests.faults.harness import GOOD, CommittedWork, Kind, NotHereError, Work
 from tests.faults.kinds import KINDS
 from tests.faults.planted import PLANTED, source_with
 from tests.faults.power_loss import KEPT, LOST, WAYS, Committed, Disk
@@ -65,6 +66,48 @@ def test_checkpoints_of_an_interrupted_run_are_compared_where_an_unbroken_run_ha
     unbroken = _run(4, 6, 8)
     found = difference(with_checkpoints_of(interrupted, unbroken), with_checkpoints_of(unbroken, interrupted))
     assert found is None if differs is None else differs in (found or "")
+
+
+def _row(step: int, loss: float = 1.0) -> dict[str, object]:
+    return {"step": step, "loss": loss}
+
+
+@pytest.mark.parametrize(
+    ("interrupted", "differs"),
+    [
+        ([_row(2), _row(4)], None),
+        ([_row(2), _row(3, 5.0), _row(4, 6.0)], None),
+        ([_row(1, 5.0), _row(2, 6.0), _row(4)], None),
+        ([_row(2), _row(4, 2.0)], "its row of the steps (2, 4)"),
+        ([_row(2), _row(2), _row(4)], "its steps are [2, 2, 4]"),
+        ([_row(2), _row(3)], "its steps are [2, 3]"),
+        ([{"step": 4, "validation": {}}, _row(4)], "its validations"),
+    ],
+)
+def test_rows_of_an_interrupted_run_are_compared_where_their_bounds_are_those_of_an_unbroken_run(
+    interrupted: list[dict[str, object]], differs: str | None
+) -> None:
+    found = rows_differ(interrupted, [_row(2), _row(4)])
+    assert found is None if differs is None else differs in (found or "")
+
+
+def test_work_that_is_whole_must_be_kept_and_not_made_again(tmp_path: Path) -> None:
+    whole = {"a/shards/x.parquet": "shard", "b/checkpoints/step-00000002/state.json": "state", "c/eval.json": "eval"}
+    for name, content in (whole | {"a/manifest.json": '{"shards/x.parquet": 0}'}).items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    committed = CommittedWork(tmp_path, {name: sha256(content.encode()).hexdigest() for name, content in whole.items()})
+    assert committed.lost() is None
+    for name, content in whole.items():
+        kept = tmp_path / "kept"
+        (tmp_path / name).rename(kept)
+        (tmp_path / name).write_text(content)
+        lost = committed.lost()
+        assert lost is not None and lost.outcome == "lost" and name in lost.said
+        kept.rename(tmp_path / name)
+    # What no manifest lists yet is not committed.
+    (tmp_path / "a/manifest.json").write_text("{}")
+    assert CommittedWork(tmp_path, {"a/shards/x.parquet": sha256(b"shard").hexdigest()}).names == set()
 
 
 def _commit(content: bytes) -> list[Call]:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from tests.faults.commands import EVAL, STUDY, SWEEP, Line, Running, one_line
+from tests.faults.commands import EVAL, STUDY, SWEEP, Line, Running
 from tests.faults.harness import MADE, Fault, Ran, Tried, Work
 
 # Two blocks of the usual size: grasp-datagen itself, with workers.
@@ -158,7 +158,7 @@ def _wrong(what: str, ran: Ran) -> Tried | None:
     if broken is not None:
         return broken
     killed = what.startswith(("the command killed", "all killed")) and ran.rc == -signal.SIGKILL
-    if ran.rc in (0, 1, 130) or killed or one_line(ran):
+    if ran.rc in (0, 1, 130) or killed or ran.one_line:
         return None
     return Tried("lost", f"exit status {ran.rc}: {ran.line}")
 
