@@ -172,7 +172,7 @@ def essence(place: Path) -> dict[str, Any]:
 def rows_differ(found: Any, expected: Any) -> str | None:
     """Return in words what is wrong with the metrics of a training that was interrupted; None where nothing is.
 
-    Validations and rounds are all the same. Steps of the rows of losses grow up to the last; rows of the same bounds are
+    Validations and rounds are all the same. Steps of the rows of losses grow up to the last; those of equal bounds are
     the same.
     """
     if not isinstance(found, list) or not isinstance(expected, list):
