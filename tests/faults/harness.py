@@ -87,8 +87,14 @@ class Ran:
 
     @property
     def one_line(self) -> bool:
-        """Whether it refused in one line, its last: a mistake of the user, or a failure of the machine."""
-        lines = [line for line in self.stderr.splitlines() if line.startswith("error: ") or line.endswith("--help)")]
+        """Whether it refused in one line, its last: a mistake of the user, or a failure of the machine.
+
+        `grasp-data verify` says a line for each fault, and then how many there are.
+        """
+        said = self.stderr.splitlines()
+        if self.rc == 2 and any(line.startswith("fault: ") for line in said):
+            return "fault" in self.line
+        lines = [line for line in said if line.startswith("error: ") or line.endswith("--help)")]
         return self.rc in (2, 74) and len(lines) == 1 and lines[0].strip() == self.line
 
     def refused(self, *named: str) -> Tried:

@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import logging
+import signal
 import time
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -50,10 +51,11 @@ class Ray:
                     elif fault.name == "the command killed":
                         running.process.kill()
                     ended = running.ended()
+            killed = fault.name == "the command killed" and ended.rc == -signal.SIGKILL
             broken = ended.broken()
-            if broken is not None:
+            if broken is not None and not killed:
                 return broken
-            if ended.rc not in (0, 1, -9) and not ended.one_line:
+            if not killed and ended.rc not in (0, 1) and not ended.one_line:
                 return Tried("lost", f"exit status {ended.rc}: {ended.line}")
             after = COLLECT.goes_on(case, work)
             said = ended.rc not in (0, -9)

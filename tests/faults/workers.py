@@ -154,11 +154,12 @@ def _holds_a_run(worker: int) -> bool:
 
 
 def _wrong(what: str, ran: Ran) -> Tried | None:
+    if ran.rc == -signal.SIGKILL and what.startswith(("the command killed", "all killed")):
+        return None
     broken = ran.broken()
     if broken is not None:
         return broken
-    killed = what.startswith(("the command killed", "all killed")) and ran.rc == -signal.SIGKILL
-    if ran.rc in (0, 1, 130) or killed or ran.one_line:
+    if ran.rc in (0, 130) or ran.one_line or (ran.rc == 1 and ran.line):
         return None
     return Tried("lost", f"exit status {ran.rc}: {ran.line}")
 
