@@ -269,6 +269,15 @@ class Running:
             time.sleep(0.01)
         return self.process.poll() is None
 
+    def has_open(self, folder: Path) -> bool:
+        """Return whether it has a file below a folder open."""
+        with contextlib.suppress(OSError):
+            return any(
+                os.fspath(link.readlink()).startswith(f"{folder}/")
+                for link in Path(f"/proc/{self.process.pid}/fd").iterdir()
+            )
+        return False
+
     def send(self, number: signal.Signals) -> None:
         """Send a signal to the process group, as a terminal does."""
         with contextlib.suppress(ProcessLookupError):

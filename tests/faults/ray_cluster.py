@@ -44,6 +44,8 @@ class Ray:
                     running = Running(work, words, case)
                     running.until((case / COLLECT.result).exists)
                     time.sleep(3.0)
+                    if running.process.poll() is not None and not full:
+                        return Tried("silently wrong", f"the fault did not happen: ended; {running.ended().line}")
                     if fault.name == "a node killed":
                         cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
                     elif fault.name == "the head killed":
@@ -55,7 +57,7 @@ class Ray:
             broken = ended.broken()
             if broken is not None and not killed:
                 return broken
-            if not killed and ended.rc not in (0, 1) and not ended.one_line:
+            if not killed and ended.rc != 0 and not (ended.rc == 1 and ended.line) and not ended.one_line:
                 return Tried("lost", f"exit status {ended.rc}: {ended.line}")
             after = COLLECT.goes_on(case, work)
             said = ended.rc not in (0, -9)
