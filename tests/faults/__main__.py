@@ -5,6 +5,7 @@ Goes on where it was stopped. Ends with results/faults.json and the table in RES
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -58,6 +59,7 @@ def main() -> int:
     given = parser.parse_args()
     if given.soak_hours is not None:
         return soak(given.soak_hours)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends in order, too
     until = time.monotonic() + 60 * given.limit_minutes
     folder = ROOT / "runs" / "faults"
     part = (0, 1) if given.part is None else (given.part, given.workers)
@@ -99,9 +101,16 @@ def share(work: Work, workers: int) -> None:
         codes = [one.wait() for one in parts]
         if any(codes):
             sys.exit("error: a process that tried faults has failed, so that some were not tried; run it again")
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command goes on")
     finally:
+        # A Ctrl-C of a terminal has reached them too: each takes away what it has started, made and mounted.
         for one in parts:
-            one.terminate()
+            try:
+                one.wait(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                one.terminate()  # nobody has told it
+                one.wait()
 
 
 def try_planted(work: Work, kinds: list[str] | None) -> int:

@@ -261,6 +261,7 @@ class Running:
         self.process = subprocess.Popen(
             [*start, *arguments], cwd=cwd, env=work.environment(env), start_new_session=True, **streams | options
         )
+        work.started[:] = [*(one for one in work.started if one.poll() is None), self.process]
 
     def until(self, there: Callable[[], Any], seconds: float = 60.0) -> bool:
         """Wait until something is there, or the command has ended; return whether it still runs."""

@@ -208,6 +208,7 @@ class Work:
         self.folder, self.inputs, self.source = folder.absolute(), folder.absolute() / "inputs", source
         self.shim = shim
         self._templates: dict[bool, subprocess.Popen[str]] = {}  # lean or not
+        self.started: list[subprocess.Popen[bytes]] = []  # leaders of process groups, which end with this work
         self._own = self.folder / "cases" / str(os.getpid())  # two may work here at once
         self.temporary = self._own / "temporary"
         self.inputs.mkdir(parents=True, exist_ok=True)
@@ -219,6 +220,10 @@ class Work:
 
     def __exit__(self, *_: object) -> None:
         self.rest()
+        for process in self.started:
+            if process.poll() is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
         shutil.rmtree(self._own, ignore_errors=True)
 
     def rest(self) -> None:
@@ -226,6 +231,7 @@ class Work:
         for template in self._templates.values():
             assert template.stdin is not None
             template.stdin.close()
+            template.terminate()  # it may wait for a command, which ends with it
             template.wait()
         self._templates.clear()
 
@@ -328,8 +334,9 @@ class Work:
                 hung = False
             except subprocess.TimeoutExpired:
                 hung = True
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+            finally:  # also where the harness is interrupted
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
             if hung:
                 out, err = process.communicate()
         return Ran(

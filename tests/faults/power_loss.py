@@ -60,8 +60,12 @@ class File:
         if not self.since:
             return self.synced
         content = self.synced
-        for step in self.since[: draws.randint(0, len(self.since))]:
+        whole = draws.randint(0, len(self.since))
+        for step in self.since[:whole]:
             content = _changed(content, *step)
+        for place, data in self.since[whole : whole + 1]:
+            if data is not None and draws.random() < 0.5:  # the next write is torn
+                content = _changed(content, place, data[: draws.randint(0, len(data))])
         # A disk may also have kept the new length, and not the bytes.
         return content.ljust(len(self.content), b"\0") if draws.random() < 0.3 else content
 

@@ -158,12 +158,15 @@ def _move(case: Path, place: Path) -> None:
 
 
 def _run(line: Line, cwd: Path, work: Work, env: dict[str, str] | None = None, inside: Path | None = None) -> Tried:
-    """Run a command and compare what it makes, in the working folder unless `inside` says where."""
+    """Run a command and compare what it makes, in the working folder unless `inside` says where.
+
+    A name of a folder may be refused; a locale, a clock and a variable of the environment may not.
+    """
     new = env is not None
     ran = work.run(line.words, cwd, env=env) if new else work.forked(line.words, cwd)
     broken = ran.broken()
     if broken is not None:
         return broken
     if ran.rc != 0:
-        return Tried("detected" if ran.one_line else "lost", ran.line)
+        return Tried("detected" if ran.one_line and not new else "lost", f"exit status {ran.rc}: {ran.line}")
     return line.fits(inside if inside is not None else cwd, work, ran)

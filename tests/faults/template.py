@@ -54,6 +54,8 @@ Request = dict[str, Any]  # argv, cwd, env, stdin, stdout, stderr (paths), secon
 def main() -> None:
     """Answer requests until there are no more."""
     sys.path.pop(0)  # this folder: names of ours must hide nobody's
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal, which is for who started this
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     nothing = os.open(os.devnull, os.O_RDWR)
     os.dup2(nothing, 0)
@@ -74,8 +76,12 @@ def _answer(request: Request) -> dict[str, Any]:
     if child == 0:
         _be(request)
     ended = os.pidfd_open(child)
-    with contextlib.closing(os.fdopen(ended)):
-        hung = not select.select([ended], [], [], request["seconds"])[0]
+    try:
+        with contextlib.closing(os.fdopen(ended)):
+            hung = not select.select([ended], [], [], request["seconds"])[0]
+    except SystemExit:
+        _kill_group(child)
+        raise
     # The child leads a group of its own: what it has started ends with it.
     if hung:
         _kill_group(child)
@@ -92,6 +98,8 @@ def _kill_group(leader: int) -> None:
 def _be(request: Request) -> NoReturn:
     """Become the process of a command; it ends as the command would."""
     os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
