@@ -101,8 +101,6 @@ def share(work: Work, workers: int) -> None:
         codes = [one.wait() for one in parts]
         if any(codes):
             sys.exit("error: a process that tried faults has failed, so that some were not tried; run it again")
-    except KeyboardInterrupt:
-        sys.exit("interrupted; the same command goes on")
     finally:
         # A Ctrl-C of a terminal has reached them too: each takes away what it has started, made and mounted.
         for one in parts:
@@ -140,4 +138,7 @@ def publish(results: list[Results], rows: list[dict[str, object]], day: str, tex
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command goes on")
