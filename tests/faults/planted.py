@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tests.faults.harness import GOOD, ROOT, Fault, Kind, Outcome, Tried, Work
+from tests.faults.crash_points import stage_of
+from tests.faults.harness import GOOD, MADE, ROOT, Fault, Kind, Outcome, Tried, Work
+from tests.faults.system_calls import SCENARIOS
 
 
 @dataclass(frozen=True)
@@ -293,6 +295,10 @@ def found_by(planted: Planted, kind: Kind, work: Work) -> tuple[Fault, Tried] | 
         kind: of the name that it asks for.
         work: with the sound code; its inputs are used.
     """
+    for name in MADE:  # with the sound code, before the other can
+        work.made(name)
+    for scenario in SCENARIOS:
+        stage_of(work).start(scenario)
     folder = work.folder / "planted" / "-".join(planted.name.split())
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("inputs", "starts"):
