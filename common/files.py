@@ -174,6 +174,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 
     Raises:
         UserError: another process holds it all that time, or it cannot be locked.
+        MachineError: it cannot be locked, as the disk does not answer or its rights are others.
     """
     lock = filelock.FileLock(folder / LOCK_NAME)
     try:
@@ -187,7 +188,8 @@ def locked(folder: Path, what: str) -> Iterator[None]:
             f"{folder}: another {what} works here; wait for its end, or choose another folder with --out"
         ) from None
     except OSError as error:
-        raise UserError(f"{folder}: cannot be locked for {what} ({error.strerror}); choose another folder") from None
+        message = f"{folder}: cannot be locked for {what} ({error.strerror}); choose another folder"
+        raise told(error, message) from None
     try:
         yield
     finally:
@@ -206,7 +208,8 @@ def temporary_folder(what: str, path_bytes: int = 4000) -> Iterator[Path]:
         path_bytes: its path has at most so many bytes, for sockets; in `/tmp` where $TMPDIR is too long for that.
 
     Raises:
-        UserError: there is no folder for temporary files that can be written to.
+        UserError: there is no folder for temporary files.
+        MachineError: it cannot be written to.
     """
     prefix, place = f"graspq-{what}-", Path("/tmp")
     try:
@@ -222,7 +225,7 @@ def temporary_folder(what: str, path_bytes: int = 4000) -> Iterator[Path]:
                     break
                 os.close(held)  # one that sweeps was faster
     except OSError as error:
-        raise UserError(f"{place}: cannot write temporary files here ({error.strerror}); set TMPDIR") from None
+        raise told(error, f"{place}: cannot write temporary files here ({error.strerror}); set TMPDIR") from None
     owner = os.getpid()
     try:
         yield folder

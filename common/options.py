@@ -352,7 +352,7 @@ class _OneLineErrors:
         except click.ClickException as error:
             click.echo(f"error: {_one_line(error.format_message())}", err=True)
             sys.exit(error.exit_code)
-        except (OSError, MemoryError, RuntimeError) as error:
+        except (OSError, MemoryError, RuntimeError, ImportError) as error:
             failure = failure_of_machine(error)
             if failure is None:
                 raise

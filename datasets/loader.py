@@ -156,7 +156,8 @@ class Loader(Generic[B]):
         if self._process is None or self._process != os.getpid():
             return
         self._buffer.cancel()
-        if self._thread is not None and self._thread is not threading.current_thread():
+        # A thread that could not be started, for want of memory, has no identity and cannot be waited for.
+        if self._thread is not None and self._thread.ident and self._thread is not threading.current_thread():
             self._thread.join()
         self._buffer.close()
 

@@ -74,6 +74,8 @@ class ShardEntry:
         expected = {steps_file(self.name), episodes_file(self.name)}
         if SHARD_NAME.fullmatch(self.name) is None or set(self.files) != expected or set(self.sizes) != expected:
             raise ValueError(f"shard {self.name!r}: expected the files {sorted(expected)}")
+        if not all(isinstance(digest, str) for digest in self.files.values()):
+            raise ValueError(f"shard {self.name}: expected a SHA-256 for each file, got {self.files}")
         counts = (self.first_block, self.blocks, self.episodes, self.rows, self.successes, *self.sizes.values())
         if not all(type(count) is int and 0 <= count <= MOST for count in counts):
             raise ValueError(f"shard {self.name}: expected whole numbers of 0 to {MOST:.0e}, got {counts}")
@@ -270,6 +272,10 @@ def _check_kinds(manifest: Manifest) -> None:
         "a name of the task": isinstance(task, dict) and isinstance(task.get("name"), str),
         "max_steps of 1 to 10,000": isinstance(task, dict) and _whole(task.get("max_steps"), 1, 10_000),
         "a block_size of 1 to 100,000": isinstance(settings, dict) and _whole(settings.get("block_size"), 1, 100_000),
+        "no blocks_per_shard, or 0 to 100,000": isinstance(settings, dict)
+        and _whole(settings.get("blocks_per_shard", 0), 0, 100_000),
+        "a name and a sha256 of the object_set": isinstance(manifest.object_set, dict)
+        and all(isinstance(manifest.object_set.get(name), str) for name in ("name", "sha256")),
         f"an image_shape of three, each 1 to {LARGEST_IMAGE}": len(shape) == 3
         and all(_whole(size, 1, LARGEST_IMAGE) for size in shape),
         "a discount of 0 to 1": isinstance(manifest.discount, int | float) and 0 <= manifest.discount <= 1,

@@ -1,7 +1,8 @@
 """Writes a shard once: temporary file, fsync, read back and verified, rename, and only then its line in the manifest.
 
 The bytes depend on the episodes and the manifest's description alone. A writer that is killed leaves `.tmp-*` files,
-which `remove_leftovers` clears, or a finished file that the manifest does not list, which is written again.
+which `remove_leftovers` clears, a finished file that the manifest does not list, which is written again, or the file
+of a shard that a longer one has replaced, which is cleared too.
 """
 
 import errno
@@ -16,7 +17,15 @@ import pyarrow.parquet as pq
 from graspq.common.errors import CommandError, MachineError, told
 from graspq.common.files import committed, remove_temporaries, sha256_of
 from graspq.datasets.episode import Episode
-from graspq.datasets.manifest import Manifest, ShardEntry, episodes_file, shard_name, steps_file
+from graspq.datasets.manifest import (
+    MANIFEST_NAME,
+    SHARD_NAME,
+    Manifest,
+    ShardEntry,
+    episodes_file,
+    shard_name,
+    steps_file,
+)
 from graspq.datasets.tables import episodes_table, parquet_settings, steps_table
 
 
@@ -70,17 +79,27 @@ def commit_shard(folder: Path, manifest: Manifest, entry: ShardEntry) -> Manifes
     """
     updated = manifest.with_shard(entry)
     updated.save(folder)
-    for path in entry.files:
-        for older in (folder / path).parent.glob(f"blocks-{entry.first_block:06d}-*.parquet"):
-            if older != folder / path:
-                older.unlink(missing_ok=True)
+    _remove_replaced(folder, [entry])
     return updated
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed writers left in a dataset; nothing else is touched."""
+    """Remove what killed writers left in a dataset: temporary files, and shards that others have replaced."""
     for part in ("", "shards", "episodes", "objects", "objects/meshes"):
         remove_temporaries(folder / part)
+    if (folder / MANIFEST_NAME).is_file():
+        _remove_replaced(folder, Manifest.load(folder).shards)
+
+
+def _remove_replaced(folder: Path, entries: Sequence[ShardEntry]) -> None:
+    """Remove the shards that begin with the block of a listed one and are not that one."""
+    listed = {entry.first_block: entry.files for entry in entries}
+    for part in ("shards", "episodes"):
+        for path in (folder / part).glob("blocks-*.parquet"):
+            if SHARD_NAME.fullmatch(path.stem) is not None:
+                files = listed.get(int(path.stem.split("-")[1]))
+                if files is not None and f"{part}/{path.name}" not in files:
+                    path.unlink(missing_ok=True)
 
 
 def _grouped(manifest: Manifest, first_block: int, blocks: int, episodes: Sequence[Episode]) -> list[list[Episode]]:

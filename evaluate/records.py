@@ -44,13 +44,22 @@ def _entries(value: Any) -> bool:
     return isinstance(value, dict)
 
 
+def _or_none(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or fits(value)
+
+
 # What eval.json holds, as far as tables and reports reckon with it, and what each must be.
 _KINDS: dict[str, Callable[[Any], bool]] = {
     "task": _words, "split": _words, "label": _words, "seed": lambda value: type(value) is int,
-    "policy": lambda value: value is None or _words(value), "successes": _count, "success_rate": _share,
-    "episodes": lambda value: _count(value) and value > 0, "job": _entries, "files": _entries, "object_set": _entries,
+    "policy": _or_none(_words), "successes": _count, "success_rate": _share,
+    "episodes": lambda value: _count(value) and value > 0, "job": _entries, "files": _entries,
+    "object_set": lambda value: _entries(value) and all(_words(value.get(name, "")) for name in ("name", "sha256")),
     "ci95": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_share, value)),
     "mean_steps": lambda value: type(value) in (int, float), "versions": _entries,
+    "ends": lambda value: _entries(value) and all(map(_count, value.values())), "cem": _or_none(_entries),
+    "run": _or_none(_words), "algo": _or_none(_words), "checkpoint_step": _or_none(_count),
+    "training_seed": _or_none(_count), "data_sha256": _or_none(_words), "recipe_sha256": _or_none(_words),
+    "trained_by": _or_none(_words), "command": _words, "code_revision": _words,
 }  # fmt: skip
 
 

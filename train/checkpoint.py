@@ -146,10 +146,11 @@ def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
         network = build(makers[part], specification)
         _fill(checkpoint / f"{names[-1]}.safetensors", network, read_tensors(checkpoint, description, names[-1]))
         networks[part] = network.eval().requires_grad_(False)
+    kept = read_tensors(checkpoint, description, KEPT)
     digests = {name: description["files"][f"{name}.safetensors"] for name in [*names, KEPT]}
     return LoadedRun(
         networks=networks,
-        kept=read_tensors(checkpoint, description, KEPT),
+        kept=kept,
         specification=specification,
         config=run.config,
         step=int(description["step"]),

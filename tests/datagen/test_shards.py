@@ -8,8 +8,9 @@ SETTINGS = CollectionSettings(block_size=20, blocks_per_shard=5)
 
 def empty_manifest():
     return Manifest(
-        task={"name": "regular", "max_steps": 15}, settings=SETTINGS.described(), versions={}, object_set={},
-        image_shape=(64, 64, 3), action=grasping((0.06, 0.06, 0.06, 0.4)), discount=1.0, phi_range=(-1.75, 1.75),
+        task={"name": "regular", "max_steps": 15}, settings=SETTINGS.described(), versions={},
+        object_set={"name": "drawn", "sha256": "0" * 64}, image_shape=(64, 64, 3),
+        action=grasping((0.06, 0.06, 0.06, 0.4)), discount=1.0, phi_range=(-1.75, 1.75),
     )  # fmt: skip
 
 

@@ -125,6 +125,20 @@ for first in range(0, 400, 4):
 """
 
 
+def test_a_shard_that_was_replaced_is_removed_by_the_next_start_if_its_writer_was_killed_before(drawn, tmp_path):
+    manifest = drawn.manifest()
+    short = write_shard(tmp_path, manifest, 0, 1, drawn.episodes(0, 1)[:-1])
+    manifest = commit_shard(tmp_path, manifest, short)
+    kept = {path: (tmp_path / path).read_bytes() for path in short.files}
+    manifest = commit_shard(tmp_path, manifest, write_shard(tmp_path, manifest, 0, 2, drawn.episodes(0, 2)))
+    for path, content in kept.items():
+        (tmp_path / path).write_bytes(content)
+    (tmp_path / "shards" / "mine.parquet").write_bytes(b"")
+    remove_leftovers(tmp_path)
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.parquet")}
+    assert left == {*manifest.shards[0].files, "shards/mine.parquet"}
+
+
 def test_a_writer_killed_at_any_moment_leaves_a_valid_dataset_that_can_go_on(drawn, tmp_path):
     folder = tmp_path / "killed"
     folder.mkdir()

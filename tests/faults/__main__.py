@@ -5,10 +5,12 @@ Goes on where it was stopped. Ends with results/faults.json and the table in RES
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import time
 import types
+from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -20,17 +22,30 @@ if not hasattr(sys.modules.get("tests"), "__file__"):
     sys.modules["tests"] = tests
 
 from graspq.common.files import write_json, write_text  # noqa: E402
-from tests.faults.harness import GOOD, MADE, Log, Work, code_digest, rows_of, table, try_kind  # noqa: E402
+from tests.faults.harness import (  # noqa: E402
+    GOOD,
+    HERE,
+    MADE,
+    Log,
+    Results,
+    Work,
+    code_digest,
+    rows_of,
+    sentence,
+    table,
+    try_kind,
+)
 from tests.faults.kinds import KINDS  # noqa: E402
 from tests.faults.planted import PLANTED, found_by  # noqa: E402
 from tests.faults.soak import soak  # noqa: E402
 from tests.faults.system_calls import shim  # noqa: E402
 
+HARNESS = (HERE / "kinds.py",)  # imports all kinds
 START, END = "<!-- made by tests/faults -->", "<!-- end of faults -->"
 
 
 def main() -> int:
-    """Try what was not tried yet; return 1 where a fault was lost, silently wrong, hung or a traceback."""
+    """Try what was not tried yet; return 1 where a fault was lost, silently wrong, hung, a traceback, or not tried."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--kind", action="append", help="only kinds whose name holds this; may be repeated")
     parser.add_argument("--short", action="store_true", help="the few that `make test` tries; publishes nothing")
@@ -44,10 +59,11 @@ def main() -> int:
     given = parser.parse_args()
     if given.soak_hours is not None:
         return soak(given.soak_hours)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends in order, too
     until = time.monotonic() + 60 * given.limit_minutes
     folder = ROOT / "runs" / "faults"
     part = (0, 1) if given.part is None else (given.part, given.workers)
-    log, found = Log(folder / "tried.jsonl"), []
+    log, results = Log(folder / "tried.jsonl"), []
     with Work(folder / code_digest(), shim=shim(folder)) as work:
         if given.planted:
             return try_planted(work, given.kind)
@@ -55,23 +71,23 @@ def main() -> int:
             share(work, given.workers)
             log.read()
         for kind in KINDS:
+            chosen = given.kind is None or any(name in kind.name for name in given.kind)
             code = code_digest(Path(sys.modules[type(kind).__module__].__file__ or ""))
-            if given.kind is None or any(name in kind.name for name in given.kind):
-                found += try_kind(kind, work, log, code, given.short, until, part)
-            else:
-                found += [
-                    (fault, log.tried[fault][1])
-                    for fault in log.tried
-                    if fault.kind == kind.name and log.knows(fault, code)
-                ]
+            if chosen or given.part is None:
+                # Of the others no more than what is known is told.
+                results.append(try_kind(kind, work, log, code, given.short, until if chosen else 0.0, part))
     if given.part is not None:
         return 0
-    rows = rows_of(found)
-    text = table(rows)
-    print(text)
-    if not given.short:
-        publish(rows, text)
-    return int(any(one.outcome not in GOOD for _, one in found))
+    rows = [row for one in results for row in rows_of(one)]
+    day = datetime.now(UTC).date().isoformat()
+    said, text = sentence(results, day, code_digest(*HARNESS)), table(rows)
+    print(f"{said}\n\n{text}")
+    red = any(tried.outcome not in GOOD for one in results for _, tried in one.tried)
+    whole = all(one.whole for one in results)
+    if given.short:
+        return int(red)
+    publish(results, rows, day, f"{said}\n\n{text}")
+    return int(red or not whole)
 
 
 def share(work: Work, workers: int) -> None:
@@ -86,8 +102,13 @@ def share(work: Work, workers: int) -> None:
         if any(codes):
             sys.exit("error: a process that tried faults has failed, so that some were not tried; run it again")
     finally:
+        # A Ctrl-C of a terminal has reached them too: each takes away what it has started, made and mounted.
         for one in parts:
-            one.terminate()
+            try:
+                one.wait(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                one.terminate()  # nobody has told it
+                one.wait()
 
 
 def try_planted(work: Work, kinds: list[str] | None) -> int:
@@ -103,9 +124,13 @@ def try_planted(work: Work, kinds: list[str] | None) -> int:
     return int(missed > 0)
 
 
-def publish(rows: list[dict[str, object]], text: str) -> None:
+def publish(results: list[Results], rows: list[dict[str, object]], day: str, text: str) -> None:
     """Write results/faults.json, and the table between its marks in RESULTS.md."""
-    write_json(ROOT / "results" / "faults.json", rows)
+    kinds = [
+        {"fault": one.kind, "planned": one.planned, "tried": len(one.tried), "why_not": one.why_not} for one in results
+    ]
+    facts = {"date": day, "code": code_digest(*HARNESS), "whole": all(one.whole for one in results)}
+    write_json(ROOT / "results" / "faults.json", {**facts, "kinds": kinds, "rows": rows})
     page = ROOT / "RESULTS.md"
     before, _, rest = page.read_text().partition(START)
     _, _, after = rest.partition(END)
@@ -113,4 +138,7 @@ def publish(rows: list[dict[str, object]], text: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command goes on")

@@ -10,7 +10,9 @@ import random
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from tests.faults.commands import essence
 from tests.faults.harness import Fault, Ran, Tried, Work, digest_of
 
 TRAINING = (
@@ -106,7 +108,7 @@ class Bits:
     def __init__(self) -> None:
         """Have no copies yet."""
         self._readings = {one.what: one for one in READINGS}
-        self._copies: dict[str, tuple[Path, Ran, dict[str, str]]] = {}
+        self._copies: dict[str, tuple[Path, Ran, dict[str, Any]]] = {}
         self._open = contextlib.ExitStack()
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
@@ -136,7 +138,7 @@ class Bits:
         finally:
             path.write_bytes(content)
 
-    def _whole(self, one: Reading, work: Work) -> tuple[Path, Ran, dict[str, str]]:
+    def _whole(self, one: Reading, work: Work) -> tuple[Path, Ran, dict[str, Any]]:
         """Return a copy to flip bits in, and what the command gives with the whole file."""
         if one.what not in self._copies:
             self._open.close()  # one copy at a time
@@ -168,12 +170,10 @@ def _flipped(case: Path, one: Reading, number: int) -> Path:
     return path
 
 
-def _outputs(case: Path, one: Reading) -> dict[str, str]:
+def _outputs(case: Path, one: Reading) -> dict[str, Any]:
     """Return the digests of what the command writes, which is then removed where it is not the work itself."""
     if one.repairs:
-        found = digest_of(case, (".lock", "tensorboard"))
-        # Rates are measured; a row of metrics says how fast it was.
-        return {name: digest for name, digest in found.items() if not name.endswith("metrics.jsonl")}
+        return essence(case)
     found = {}
     for path in sorted(case.glob("fresh*")):
         if path.is_dir():
@@ -188,7 +188,7 @@ def _outputs(case: Path, one: Reading) -> dict[str, str]:
     return found
 
 
-def _judged(one: Reading, path: Path, before: Ran, ran: Ran, whole: dict[str, str], now: dict[str, str]) -> Tried:
+def _judged(one: Reading, path: Path, before: Ran, ran: Ran, whole: dict[str, Any], now: dict[str, Any]) -> Tried:
     broken = ran.broken()
     if broken is not None:
         return broken
@@ -198,6 +198,8 @@ def _judged(one: Reading, path: Path, before: Ran, ran: Ran, whole: dict[str, st
     if now != whole:
         differing = [name for name in {**whole, **now} if whole.get(name) != now.get(name)]
         return Tried("silently wrong", f"exit status 0, {differing[:3]} are others: {ran.line}")
+    if one.repairs and not names_it and path.parent.name not in ran.stderr:
+        return Tried("silently wrong", f"made again without a word of {path.name}: {ran.line}")
     if ran.stdout != before.stdout:
         return Tried("detected" if names_it else "silently wrong", ran.line if names_it else ran.stdout[-200:])
     return Tried("detected" if names_it else "survived", ran.line if names_it else "the same bytes")

@@ -1,6 +1,7 @@
 """The commands that faults meet, each on small work of its own, and what must be the same however they got there."""
 
 import contextlib
+import csv
 import hashlib
 import json
 import os
@@ -11,11 +12,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tests.faults.harness import MADE, SECONDS, TRAINING, Ran, Tried, Work
+from tests.faults.harness import MADE, SECONDS, TRAINING, CommittedWork, Ran, Tried, Work, digest_of
 
 # What no two runs share: speed, the revision of the code, and digests of rows that hold them.
 _VARYING = {
@@ -37,12 +38,16 @@ class Line:
         needs: inputs that must be there.
         result: what it makes, a path; "" for nothing.
         made: the input that an unbroken run of it made.
+        beside: paths of what it makes besides.
+        says: what it says in the end is compared, not what it makes.
     """
 
     words: tuple[str, ...]
     needs: tuple[str, ...]
     result: str = ""
     made: str = ""
+    beside: tuple[str, ...] = ()
+    says: bool = False
 
     @property
     def name(self) -> str:
@@ -60,37 +65,77 @@ class Line:
                     (case / name).write_bytes((work.inputs / name).read_bytes())
             yield case
 
-    def reference(self, work: Work) -> dict[str, Any]:
-        """Return the essence of what an unbroken run makes."""
-        work.made(self.made)
-        return essence(work.inputs / self.result)
+    def all_made(self, folder: Path) -> dict[str, Any]:
+        """Return the essence of all that it makes in a folder."""
+        found = essence(folder / self.result)
+        for name in self.beside:
+            found |= {f"{name}/{inside}": one for inside, one in essence(folder / name).items()}
+        return found
 
-    def fits(self, case: Path, work: Work, *, interrupted: bool = False) -> Tried:
-        """Compare what it has made with an unbroken run's.
+    def fits(self, case: Path, work: Work, ran: Ran | None = None, *, interrupted: bool = False) -> Tried:
+        """Compare what it has made with an unbroken run's, and that nothing temporary is left.
 
-        A training that was interrupted wrote what it had measured since its last row: rows have other bounds then, and
-        those of validations alone are compared. It wrote a checkpoint, too, that an unbroken run has not, and that one
-        pushed out an older one: those of the steps that both have are compared, the last one among them.
+        A training that was interrupted wrote what it had measured since its last row: rows have other bounds then, see
+        `rows_differ`. It wrote a checkpoint, too, that an unbroken run has not, and that one pushed out an older one:
+        those of the steps that both have are compared, the last one among them.
+
+        Args:
+            case: the working folder.
+            work: that it is a case of.
+            ran: how it ended, where what it said could be heard.
+            interrupted: whether it was, and has gone on.
         """
+        left = work.left_over(case)
+        if left is not None:
+            return Tried("lost", f"{left}: left over")
+        if self.says:
+            if ran is None or _told(ran.stdout) == _told(self._said(work)):
+                return Tried("survived")
+            return Tried("silently wrong", f"says another thing: {ran.stdout[-200:]}")
         if not self.made:
             return Tried("survived")
-        found, expected = essence(case / self.result), self.reference(work)
-        for one in (found, expected) if interrupted else ():
-            for name in one:
-                if name.endswith("metrics.jsonl") and isinstance(one[name], list):
-                    one[name] = [row for row in one[name] if "validation" in row]
+        work.made(self.made)
+        found, expected = self.all_made(case), self.all_made(work.inputs)
         if interrupted:
+            for name in [name for name in found.keys() & expected.keys() if name.endswith("metrics.jsonl")]:
+                differs = rows_differ(found.pop(name), expected.pop(name))
+                if differs is not None:
+                    return Tried("silently wrong", f"{name}: {differs}")
             found, expected = with_checkpoints_of(found, expected), with_checkpoints_of(expected, found)
         differs = difference(found, expected)
         return Tried("survived") if differs is None else Tried("silently wrong", differs)
 
+    def _said(self, work: Work) -> str:
+        """Return what the command says of the inputs, whatever its words call them here."""
+        line = next(line for line in LINES if line.name == self.name)
+        if self.name not in _SAYINGS:
+            with line.case(work) as case:
+                _SAYINGS[self.name] = work.forked(line.words, case).stdout
+        return _SAYINGS[self.name]
+
+    def committed(self, case: Path, work: Work) -> CommittedWork:
+        """Take note of what is whole in a folder that it was broken off in."""
+        whole = digest_of(work.made(self.made)) if self.made and (work.inputs / self.result).is_dir() else {}
+        return CommittedWork(case / self.result, whole)
+
     def goes_on(self, case: Path, work: Work, env: Mapping[str, str] | None = None) -> Tried:
         """Run the same command again, and compare: nothing may be lost, and it must come to its end."""
+        committed = self.committed(case, work)
         again = work.forked(self.words, case, env=env)
         broken = again.broken()
         if broken is not None:
             return broken
-        return self.fits(case, work, interrupted=True) if again.rc == 0 else Tried("lost", again.line)
+        if again.rc != 0:
+            return Tried("lost", again.line)
+        return committed.lost() or self.fits(case, work, again, interrupted=True)
+
+
+_SAYINGS: dict[str, str] = {}
+
+
+def _told(said: str) -> str:
+    """Return what a command said of a folder, without the folder's name."""
+    return said.strip().rpartition(": ")[2]
 
 
 def _of(made: str, *needs: str) -> Line:
@@ -98,12 +143,11 @@ def _of(made: str, *needs: str) -> Line:
 
 
 OBJECTS, DATAGEN, TRAIN = _of("objects"), _of("dataset", "objects"), _of("run", "dataset")
-EVAL, SWEEP, STUDY = _of("evaluation", "dataset", "run"), _of("sweep", "dataset"), _of("study", "dataset")
+EVAL, SWEEP = _of("evaluation", "dataset", "run"), _of("sweep", "dataset")
+STUDY = replace(_of("study", "dataset"), beside=("results", "page.md", "recipe.json"))
 ONLINE = _of("online", "dataset", "run")
-REPORT = Line(
-    ("grasp-report", "runs", "scores", "--out", "report.html"), ("dataset", "run", "evaluation"), "report.html"
-)
-VERIFY = Line(("grasp-data", "verify", "data/regular-24", "--workers", "0"), ("dataset",))
+REPORT = _of("report", "dataset", "run", "evaluation")
+VERIFY = Line(("grasp-data", "verify", "data/regular-24", "--workers", "0"), ("dataset",), says=True)
 LINES = (OBJECTS, DATAGEN, TRAIN, EVAL, SWEEP, STUDY, ONLINE, REPORT, VERIFY)
 MAKING = (OBJECTS, DATAGEN, TRAIN, EVAL, SWEEP, STUDY, ONLINE)
 
@@ -123,6 +167,28 @@ def essence(place: Path) -> dict[str, Any]:
         if path.is_file() and not any(part in _LEFT_OUT for part in inside):
             found["/".join(inside)] = _content(path)
     return found
+
+
+def rows_differ(found: Any, expected: Any) -> str | None:
+    """Return in words what is wrong with the metrics of a training that was interrupted; None where nothing is.
+
+    Validations and rounds are all the same. Steps of the rows of losses grow up to the last; those of equal bounds are
+    the same.
+    """
+    if not isinstance(found, list) or not isinstance(expected, list):
+        return None if found == expected else "is another than that of an unbroken run"
+    if [row for row in found if "loss" not in row] != [row for row in expected if "loss" not in row]:
+        return "its validations or rounds are others than those of an unbroken run"
+    trained, whole = ([row for row in rows if "loss" in row] for rows in (found, expected))
+    steps = [row["step"] for row in trained]
+    if steps != sorted(set(steps)) or steps[-1:] != [row["step"] for row in whole][-1:]:
+        return f"its steps are {steps}"
+    ours, theirs = (
+        {(before.get("step"), row["step"]): row for before, row in zip([{}, *rows], rows, strict=False)}
+        for rows in (trained, whole)
+    )
+    differing = next((bounds for bounds in ours.keys() & theirs.keys() if ours[bounds] != theirs[bounds]), None)
+    return None if differing is None else f"its row of the steps {differing} is another than that of an unbroken run"
 
 
 def with_checkpoints_of(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
@@ -154,8 +220,11 @@ def _content(path: Path) -> Any:
             return _kept(json.loads(text))
         if path.suffix == ".jsonl":
             return [_kept(json.loads(line)) for line in text.splitlines()]
-        if path.suffix in (".csv", ".html", ".md"):
-            return "there"
+        if path.suffix == ".csv":
+            rows = csv.DictReader(text.decode().splitlines())
+            return [{name: cell for name, cell in row.items() if name not in _VARYING | _SAID} for row in rows]
+        if path.suffix == ".md":  # its words say where it was made, and of which revision of the code
+            return [line for line in text.splitlines() if line.startswith(b"|")]
     except ValueError as error:
         return f"{path.name} is no JSON: {error}"
     return hashlib.sha256(text).hexdigest()
@@ -192,6 +261,7 @@ class Running:
         self.process = subprocess.Popen(
             [*start, *arguments], cwd=cwd, env=work.environment(env), start_new_session=True, **streams | options
         )
+        work.started[:] = [*(one for one in work.started if one.poll() is None), self.process]
 
     def until(self, there: Callable[[], Any], seconds: float = 60.0) -> bool:
         """Wait until something is there, or the command has ended; return whether it still runs."""
@@ -199,6 +269,15 @@ class Running:
         while self.process.poll() is None and not there() and time.monotonic() < until:
             time.sleep(0.01)
         return self.process.poll() is None
+
+    def has_open(self, folder: Path) -> bool:
+        """Return whether it has a file below a folder open."""
+        with contextlib.suppress(OSError):
+            return any(
+                os.fspath(link.readlink()).startswith(f"{folder}/")
+                for link in Path(f"/proc/{self.process.pid}/fd").iterdir()
+            )
+        return False
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal to the process group, as a terminal does."""
@@ -247,8 +326,3 @@ def _with_usual_signals() -> None:
     """Let no signal be ignored because it was so where the harness was started, as in the background or by nohup."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-
-
-def one_line(ran: Ran) -> bool:
-    """Return whether a command refused in one line: a mistake of the user, or a failure of the machine."""
-    return ran.rc in (2, 74) and re.search(r"(?m)^error: .+$", ran.stderr) is not None

@@ -3,11 +3,11 @@
 import os
 import shutil
 import signal
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.faults.harness import Fault, Ran, Tried, Work
+from tests.faults.harness import CommittedWork, Fault, NotHereError, Ran, Tried, Work
 from tests.faults.system_calls import (
     CHANGES,
     FSYNC,
@@ -56,8 +56,8 @@ class CrashPoints:
             )
             killed = work.forked(scenario.argv, case, armed=what)
             if killed.rc != -signal.SIGKILL:
-                return killed.broken() or Tried("survived", "ended before that call")
-            return gone_on(work.forked(scenario.argv, case), scenario, case, stage)
+                return not_met(killed)
+            return gone_on(scenario, case, work)
 
 
 @dataclass
@@ -68,7 +68,9 @@ class KilledByStrace:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return a few for each command; none in the short form."""
-        for scenario in scenarios(work, short, None) if shutil.which("strace") is not None else ():
+        if shutil.which("strace") is None:
+            raise NotHereError("no strace here")
+        for scenario in scenarios(work, short, None):
             unbroken = stage_of(work).unbroken(scenario)
             for name, calls in (("fsync", FSYNC), ("rename", RENAME)):
                 for number in few(range(1, unbroken.count(calls) + 1), 3):
@@ -82,9 +84,9 @@ class KilledByStrace:
             tracer = ("strace", "-f", "-qq", "-o", os.devnull, "-e", f"trace={name}")
             what = f"inject={name}:signal=KILL:when={number}"
             killed = work.run(scenario.argv, case, before=(*tracer, "-e", what))
-            if killed.rc == 0:
-                return Tried("silently wrong", "was not killed")
-            return gone_on(work.forked(scenario.argv, case), scenario, case, stage)
+            if killed.rc != -signal.SIGKILL:
+                return not_met(killed)
+            return gone_on(scenario, case, work)
 
 
 _STAGES: dict[Work, Stage] = {}
@@ -100,12 +102,30 @@ def few(numbers: range, count: int) -> list[int]:
     return sorted({numbers[(2 * one + 1) * len(numbers) // (2 * count)] for one in range(count)}) if numbers else []
 
 
-def gone_on(again: Ran, scenario: Scenario, case: Path, stage: Stage) -> Tried:
-    """Judge the same command, run again after it was broken off."""
+def not_met(ran: Ran) -> Tried:
+    """Judge a command that ended without the fault that it was to meet: nothing is shown by it."""
+    return ran.broken() or Tried("silently wrong", f"the fault did not happen, exit status {ran.rc}: {ran.line}")
+
+
+def gone_on(scenario: Scenario, case: Path, work: Work, more: Sequence[str] = ()) -> Tried:
+    """Run the same command again after it was broken off: it must keep what is whole, and end as if it had not been.
+
+    Args:
+        scenario: of the command.
+        case: its working folder.
+        work: runs it.
+        more: words besides.
+    """
+    unbroken = stage_of(work).unbroken(scenario).files
+    committed = CommittedWork(case, unbroken)
+    again = work.forked([*scenario.argv, *more], case)
     broken = again.broken()
     if broken is not None:
         return broken
     if again.rc != 0:
         return Tried("lost", again.line)
-    differs = difference(compared(case), stage.unbroken(scenario).files)
-    return Tried("survived") if differs is None else Tried("silently wrong", differs)
+    differs = difference(compared(case), unbroken)
+    if differs is not None:
+        return Tried("silently wrong", differs)
+    left = work.left_over(case)
+    return committed.lost() or (Tried("survived") if left is None else Tried("lost", f"{left}: left over"))

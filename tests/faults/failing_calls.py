@@ -8,13 +8,14 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.faults.crash_points import few, gone_on, stage_of
-from tests.faults.harness import Fault, Ran, Tried, Work
+from tests.faults.crash_points import few, gone_on, not_met, stage_of
+from tests.faults.harness import Fault, NotHereError, Ran, Tried, Work
 from tests.faults.system_calls import (
     CREATE,
     FAIL,
@@ -30,7 +31,6 @@ from tests.faults.system_calls import (
     WRITE,
     Call,
     Scenario,
-    Stage,
     armed,
     compared,
     difference,
@@ -42,21 +42,22 @@ MOST = 12  # of each kind and command, evenly spread; more where they would miss
 IN_SHORT = ("EIO in write", "ENOSPC in open")  # the kinds that `make test` tries
 
 
-def judged(ran: Ran, scenario: Scenario, stage: Stage, case: Path, again: Ran | None) -> Tried:
+NAMED = re.compile(r"(?<![\w-])(new(-results)?[/:]|data/regular-24|runs/mc|objects/|page\.md|plan\.toml)")
+
+
+def judged(ran: Ran, scenario: Scenario, case: Path, work: Work) -> Tried:
     """Judge a command that met a failure, and the same command after it."""
     broken = ran.broken()
     if broken is not None:
         return broken
     if ran.rc == 0:
-        differs = difference(compared(case), stage.unbroken(scenario).files)
+        differs = difference(compared(case), stage_of(work).unbroken(scenario).files)
         return Tried("survived") if differs is None else Tried("silently wrong", differs)
-    if not any(
-        name in ran.line
-        for name in ("new", "data/regular-24", "runs/mc", "objects/", "page.md", "plan.toml", str(case), NO_MEMORY)
-    ):
+    if not ran.one_line:
+        return Tried("silently wrong", f"exit status {ran.rc}, not one line: {ran.stderr[-300:]}")
+    if not NAMED.search(ran.line) and not any(name in ran.line for name in (str(case), NO_MEMORY)):
         return Tried("silently wrong", f"names no file: {ran.line}")
-    assert again is not None
-    after = gone_on(again, scenario, case, stage)
+    after = gone_on(scenario, case, work)
     return Tried("detected", ran.line) if after.outcome == "survived" else after
 
 
@@ -81,10 +82,12 @@ class FailingCalls:
         """Run the command with the failure, then without."""
         stage, scenario = stage_of(work), OF_COMMAND[fault.command]
         with stage.begun(scenario) as case:
-            what = armed(case, self.mode, int(fault.name), error=self.error, calls=self.calls)
+            met = case.with_name(f"{case.name}-met")
+            what = armed(case, self.mode, int(fault.name), error=self.error, calls=self.calls, log=met)
             ran = work.forked(scenario.argv, case, armed=what)
-            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
-            return judged(ran, scenario, stage, case, again)
+            failed = met.stat().st_size > 0
+            met.unlink()
+            return judged(ran, scenario, case, work) if failed else not_met(ran)
 
 
 def _of_each_file(calls: Sequence[Call]) -> list[int]:
@@ -120,9 +123,16 @@ def mounted(case: Path, *options: str) -> Iterator[None]:
         subprocess.run(["umount", "-l", str(case)], check=True, capture_output=True)
 
 
-def can_mount() -> bool:
-    """Return whether this process may mount."""
-    return os.geteuid() == 0 and shutil.which("mount") is not None
+def must_mount() -> None:
+    """Raise NotHereError unless this process may mount."""
+    mount = shutil.which("mount")
+    if os.geteuid() != 0 or mount is None:
+        raise NotHereError("needs root and mount")
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        ran = subprocess.run([mount, "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True)
+        if ran.returncode != 0:
+            raise NotHereError(f"mount: {ran.stderr.decode(errors='replace').strip()}")
+        subprocess.run(["umount", "-l", folder], check=True, capture_output=True)
 
 
 @dataclass
@@ -133,7 +143,8 @@ class FullDisk:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return some sizes for each command."""
-        for scenario in scenarios(work, short) if can_mount() else ():
+        must_mount()
+        for scenario in scenarios(work, short):
             for percent in (50,) if short else range(5, 100, 10):
                 yield Fault(self.name, scenario.command, f"{percent} % of the room")
 
@@ -145,13 +156,12 @@ class FullDisk:
         with stage.begun(scenario) as case:
             ran = work.forked(scenario.argv, case)
             needed = _pages(case) - before
-        room = before + int(fault.name.split()[0]) * needed // 100
+        room = max(before + int(fault.name.split()[0]) * needed // 100, 1)  # a size of 0 would be no bound
         with work.copy() as case, mounted(case, "-t", "tmpfs", "-o", f"size={4 * room}k", "tmpfs"):
             shutil.copytree(start, case, symlinks=True, dirs_exist_ok=True)
             ran = work.forked(scenario.argv, case)
             subprocess.run(["mount", "-o", "remount,size=256m", str(case)], check=True)
-            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
-            return judged(ran, scenario, stage, case, again)
+            return judged(ran, scenario, case, work)
 
 
 def _pages(folder: Path) -> int:
@@ -167,7 +177,8 @@ class ReadOnly:
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return one for each command; none in the short form."""
-        for scenario in scenarios(work, short, None) if can_mount() else ():
+        must_mount()
+        for scenario in scenarios(work, short, None):
             yield Fault(self.name, scenario.command, "whole working folder")
 
     def tried(self, fault: Fault, work: Work) -> Tried:
@@ -177,8 +188,7 @@ class ReadOnly:
             with mounted(case, "--bind", str(case)):
                 subprocess.run(["mount", "-o", "remount,bind,ro", str(case)], check=True)
                 ran = work.forked(scenario.argv, case)
-            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
-            return judged(ran, scenario, stage, case, again)
+            return judged(ran, scenario, case, work)
 
 
 @dataclass
@@ -198,10 +208,9 @@ class Limits:
     def tried(self, fault: Fault, work: Work) -> Tried:
         """Run the command with the limit, then without."""
         stage, scenario = stage_of(work), OF_COMMAND[fault.command]
-        value = int(fault.name)
-        if self.limit == "RLIMIT_AS":
-            value = value * 2**20 + work.address_space
+        value, memory = int(fault.name), self.limit == "RLIMIT_AS"
+        if memory:
+            value = value * 2**20 + work.address_space(lean=True)
         with stage.begun(scenario) as case:
-            ran = work.forked(scenario.argv, case, limits={self.limit: value})
-            again = work.forked(scenario.argv, case) if ran.rc != 0 and not ran.hung else None
-            return judged(ran, scenario, stage, case, again)
+            ran = work.forked(scenario.argv, case, limits={self.limit: value}, lean=memory)
+            return judged(ran, scenario, case, work)

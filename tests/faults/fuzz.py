@@ -6,7 +6,7 @@ Each fault is a batch of cases that hypothesis draws from a seed, in one forked 
 from collections.abc import Iterable
 
 from tests.faults.harness import HERE, Fault, Tried, Work
-from tests.faults.hostile import LIMITS
+from tests.faults.hostile import limits
 
 BATCH = 250
 # Target -> batches. 85 x 250 cases are 21,250.
@@ -42,7 +42,7 @@ class Fuzz:
         count = cases.split()[0]
         with work.copy("objects", "dataset", "run", "evaluation") as case:
             words = [HERE / "fuzz_cases.py", target, seed.split()[1], count]
-            ran = work.forked(words, case, seconds=1200, limits=LIMITS)
+            ran = work.forked(words, case, seconds=1200, limits=limits(work))
         broken = ran.broken()
         if broken is not None:
             return Tried(broken.outcome, ran.stderr[-1500:], int(count))

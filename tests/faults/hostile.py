@@ -8,10 +8,11 @@ import json
 import os
 import shutil
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -21,6 +22,15 @@ from tests.faults.bits import FREEZE, LOAD, PLAN_SWEEP, REPORT_RUN, REPORT_SCORE
 from tests.faults.harness import Fault, Tried, Work
 
 SECRET = "nobody-is-to-read-this"
+FACES = "1 3 4,1 4 2,5 6 8,5 8 7,1 2 6,1 6 5,3 7 8,3 8 4,1 5 7,1 7 3,2 4 8,2 8 6"
+BOX = "\n".join(
+    [f"v {x} {y} {z}" for x in (0, 0.05) for y in (0, 0.05) for z in (0, 0.05)]
+    + [f"f {face}" for face in FACES.split(",")]
+)
+SECRETS = {name: f"# {SECRET}\n{BOX}\n".encode() for name in ("secret", "secret.obj", "secret.urdf", "secret.mtl")}
+# Right, so that who follows a path out of its folder finds nothing wrong.
+SECRET_SHA256 = hashlib.sha256(SECRETS["secret"]).hexdigest()
+PASSWD_SHA256 = hashlib.sha256(Path("/etc/passwd").read_bytes()).hexdigest()
 DATA, RUN = Path("data/regular-24"), Path("runs/mc")
 Change = Callable[[Path], None]
 
@@ -205,6 +215,16 @@ def weights(make: Callable[[bytes], bytes]) -> Change:
     return write
 
 
+def elsewhere_in_state(case: Path) -> None:
+    """List a file outside of a checkpoint's folder with its right digest."""
+    digest = hashlib.sha256((case / RUN / "config.json").read_bytes()).hexdigest()
+    _json(
+        f"{RUN}/checkpoints/step-00000008/state.json",
+        _signed_state,
+        lambda values: values["files"].update({"../../config.json": digest}),
+    )(case)
+
+
 def _header(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
     def make(content: bytes) -> bytes:
         (length,) = struct.unpack("<Q", content[:8])
@@ -245,7 +265,7 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
             "mesh ../": record("objects.0.mesh", "../secret.obj"),
             "mesh of root": record("objects.0.mesh", "/etc/passwd"),
             "urdf ../": record("objects.0.urdf", "../../secret.urdf"),
-            "sha256 of a file elsewhere": record("objects.0.sha256", {"../secret": "0" * 64}),
+            "sha256 of a file elsewhere": record("objects.0.sha256", {"../secret": SECRET_SHA256}),
             "sha256 a list": record("objects.0.sha256", ["meshes/train_000.obj", "meshes/train_000.urdf"]),
             "id ../": record("objects.0.object_id", "../../secret"),
             "id of a million letters": record("objects.0.object_id", "a" * 1_000_000),
@@ -304,10 +324,15 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
         VERIFY,
         ("dataset",),
         {
-            "files ../": manifest("files", {"../../secret": "0" * 64}),
-            "files of root": manifest("files", {"/etc/passwd": "0" * 64}),
+            "files ../": manifest("files", {"../../secret": SECRET_SHA256}),
+            "files of root": manifest("files", {"/etc/passwd": PASSWD_SHA256}),
             "files a list": manifest("files", ["README.md"]),
             "shard ../": manifest("shards.0.name", "../../secret"),
+            "shard's digests lists": _json(
+                f"{DATA}/manifest.json",
+                _signed_manifest,
+                lambda values: values["shards"][0].update(files={name: [1] for name in values["shards"][0]["files"]}),
+            ),
             "shard's files elsewhere": manifest("shards.0.files", {"../secret.parquet": "0" * 64}),
             "blocks of 10^18": manifest("shards.0.blocks", 10**18),
             "blocks of 10^9": manifest("shards.0.blocks", 10**9),
@@ -337,6 +362,8 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
             "task of 10^18 steps": manifest("task.max_steps", 10**18),
             "settings a word": manifest("settings", "fast"),
             "object set a word": manifest("object_set", "own"),
+            "object set without a name": manifest("object_set", {"sha256": "0" * 64}),
+            "blocks of a shard a list": manifest("settings.blocks_per_shard", [2]),
             "phi range of one": manifest("phi_range", [1]),
             "format a list": manifest("format_version", [2]),
             "format 10^18": manifest("format_version", 10**18),
@@ -430,8 +457,15 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
         LOAD,
         ("dataset", "run"),
         {
-            "files ../": state("files", {"../../config.json": "0" * 64}),
+            "files ../": elsewhere_in_state,
             "files a list": state("files", ["q.safetensors"]),
+            "files without one": _json(
+                f"{RUN}/checkpoints/step-00000008/state.json",
+                _signed_state,
+                lambda values: values.update(
+                    files={name: digest for name, digest in values["files"].items() if "kept" not in name}
+                ),
+            ),
             "step a word": state("step", "8"),
             "step 10^18": state("step", 10**18),
             "parts of numbers": state("parts", [1, 2]),
@@ -505,6 +539,9 @@ HOSTILE: dict[str, tuple[str, tuple[str, ...], dict[str, Change]]] = {
             "files a list": score("files", ["episodes.jsonl"]),
             "object set a word": score("object_set", "own"),
             "versions a list": score("versions", []),
+            "ends a list": score("ends", [0]),
+            "checkpoint a list": score("checkpoint_step", [8]),
+            "digest of the object set a number": score("object_set.sha256", 5),
         },
     ),
     "table of a sweep": (
@@ -579,11 +616,6 @@ READS = {
     "jobs": "grasp-eval --jobs hostile.toml --objects objects --out fresh --plan --workers 0",
 }
 # Folders of meshes that are made an object set: name -> files, and whether the import must refuse.
-FACES = "1 3 4,1 4 2,5 6 8,5 8 7,1 2 6,1 6 5,3 7 8,3 8 4,1 5 7,1 7 3,2 4 8,2 8 6"
-BOX = "\n".join(
-    [f"v {x} {y} {z}" for x in (0, 0.05) for y in (0, 0.05) for z in (0, 0.05)]
-    + [f"f {face}" for face in FACES.split(",")]
-)
 URDF = "<robot name='a'><link name='b'><visual><geometry><mesh filename='{}'/></geometry></visual></link></robot>"
 IMPORTS: dict[str, dict[str, str]] = {
     "URDF names ../": {"a.urdf": URDF.format("../secret.obj")},
@@ -629,6 +661,7 @@ class Hostile:
             yield Fault(self.name, "grasp-objects", f"import: {what}")
         yield Fault(self.name, "grasp-report", "markup")
         yield Fault(self.name, "grasp-eval", "pickle")
+        yield Fault(self.name, "grasp-report", "pickle")
 
     def tried(self, fault: Fault, work: Work) -> Tried:
         """Make the file and let the command read it; memory is bounded, so that nothing is allocated by its word."""
@@ -640,20 +673,18 @@ class Hostile:
         if group == "markup":
             return self._markup(work)
         if group == "pickle":
-            return self._pickle(work)
+            return self._pickle(work) if fault.command == "grasp-eval" else self._pickled_films(work)
         command, needs, changes = HOSTILE[group]
         with work.copy(*needs) as case:
             _secrets(case)
             changes[what](case)
-            ran = work.forked(command.split(), case, seconds=120, limits=LIMITS)
-            return _told(ran.refused(), ran.stdout + ran.stderr)
+            return _refused(command.split(), case, work, NAMES[group])
 
     def _plan(self, what: str, work: Work) -> Tried:
         reads, content = PLANS[what]
         with work.copy("dataset", "objects") as case:
             (case / "hostile.toml").write_text(content, errors="surrogateescape")
-            ran = work.forked(READS[reads].split(), case, seconds=120, limits=LIMITS)
-            return ran.refused()
+            return _refused(READS[reads].split(), case, work, ("hostile.toml", "--", "policy "))
 
     def _import(self, what: str, work: Work) -> Tried:
         with work.copy() as case:
@@ -667,8 +698,7 @@ class Hostile:
                     (source / name).write_bytes(content.encode("latin-1"))
             (source / "linked.obj").unlink(missing_ok=True)
             (source / "linked.obj").symlink_to(case / "secret.obj")
-            ran = work.forked(["grasp-objects", "make", "import", "source", "fresh"], case, seconds=120, limits=LIMITS)
-            return _told(ran.refused(), ran.stdout + ran.stderr)
+            return _refused(["grasp-objects", "make", "import", "source", "fresh"], case, work, ("source",))
 
     def _markup(self, work: Work) -> Tried:
         """Names with markup stand in a report as text."""
@@ -684,23 +714,65 @@ class Hostile:
             return Tried("silently wrong", "markup in the page") if bad else Tried("survived", "as text")
 
     def _pickle(self, work: Work) -> Tried:
-        """A checkpoint and films of pickles run nothing."""
+        """A checkpoint of a pickle runs nothing."""
         with work.copy("dataset", "run") as case:
             weights(lambda content: PICKLE)(case)
-            ran = work.forked(LOAD.split(), case, seconds=120, limits=LIMITS)
-            if (case / "ran").exists():
-                return Tried("silently wrong", "a pickle was run")
-            return ran.refused()
+            return _refused(LOAD.split(), case, work, ("runs/mc",))
+
+    def _pickled_films(self, work: Work) -> Tried:
+        """Films of pickled arrays run nothing."""
+        with work.copy("evaluation") as case:
+            path = next(case.glob("scores/*/films.npz"))
+            with np.load(path) as found:
+                names = list(found)
+            np.savez(path, **{name: np.array([Runs()], dtype=object) for name in names})
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            change = _json("scores/*/eval.json", _checked, lambda values: values["files"].update({path.name: digest}))
+            change(case)
+            return _refused(REPORT_SCORES.split(), case, work, ("scores",))
+
+
+class Runs:
+    """What makes a file in the working folder when it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, ("touch ran",)
 
 
 PICKLE = b"cos\nsystem\n(S'touch ran'\ntR."
-LIMITS = {"RLIMIT_AS": 12 * 2**30}
+ROOM = 2**30  # bytes of address space that a command gets besides what it has when it begins
+# What a refusal names: the file or its folder, or the setting in it that cannot be.
+NAMES = {
+    "object set": ("objects",), "object set of a stranger, signed": ("objects",),
+    "manifest": ("data/regular-24", "action space"), "shard": ("data/regular-24",), "episodes": ("data/regular-24",),
+    "weights": ("runs/mc",), "checkpoint": ("runs/mc", "network specification"),
+    "run": ("runs/mc", "--algo", "task ", "time_step"), "run in a report": ("runs/mc",),
+    "evaluation in a report": ("scores",), "table of a sweep": ("sweep",), "plan of a sweep": ("sweep",),
+    "frozen recipe": ("recipe.json",),
+}  # fmt: skip
+
+
+def limits(work: Work) -> dict[str, int]:
+    """Return the bound of a command's memory: little more than it has; nothing is allocated by a file's word."""
+    return {"RLIMIT_AS": work.address_space() + ROOM}
 
 
 def _secrets(case: Path) -> None:
-    for name in ("secret", "secret.obj", "secret.urdf", "secret.mtl"):
-        (case / name).write_text(f"# {SECRET}\n{BOX}\n")
+    for name, content in SECRETS.items():
+        (case / name).write_bytes(content)
 
 
-def _told(tried: Tried, said: str) -> Tried:
-    return Tried("silently wrong", "tells what is in a file elsewhere") if SECRET in said else tried
+def _refused(words: Sequence[str], case: Path, work: Work, names: tuple[str, ...]) -> Tried:
+    """Run a command that must refuse and name the file, tell nothing of files elsewhere, and write none there."""
+    places = (case, case.parent)
+    before = [{path.name for path in place.iterdir()} for place in places]
+    ran = work.forked(words, case, seconds=120, limits=limits(work))
+    if SECRET in ran.stdout + ran.stderr:
+        return Tried("silently wrong", "tells what is in a file elsewhere")
+    new = {path.name for place, names_before in zip(places, before, strict=True) for path in place.iterdir()
+           if path.name not in names_before and not path.name.startswith("fresh")}  # fmt: skip
+    if new - {"said", "temporary"}:
+        return Tried("silently wrong", f"has made {sorted(new)}")
+    if any((case / name).exists() and (case / name).read_bytes() != content for name, content in SECRETS.items()):
+        return Tried("silently wrong", "has changed a file elsewhere")
+    return ran.refused(*names)

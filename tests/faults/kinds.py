@@ -25,7 +25,7 @@ KINDS: list[Kind] = [
     FullDisk(),
     ReadOnly(),
     Limits("few open files (ulimit -n)", "RLIMIT_NOFILE", (64, 16, 10, 7)),
-    Limits("little memory (ulimit -v), MiB above the start", "RLIMIT_AS", (64, 16, 256)),
+    Limits("little memory (ulimit -v), MiB above the start", "RLIMIT_AS", (64, 128, 256)),
     Bits(),
     Shards(),
     Hostile(),

@@ -7,8 +7,11 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from tests.faults.harness import GOOD, ROOT, Fault, Kind, Tried, Work
+from tests.faults.crash_points import stage_of
+from tests.faults.harness import GOOD, MADE, ROOT, Fault, Kind, Outcome, Tried, Work
+from tests.faults.system_calls import SCENARIOS
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,7 @@ class Planted:
         commands: whose faults are tried, in this order, until one finds it.
         most: at most so many faults are tried of each command, evenly spread; all where it is 0.
         names: only faults whose name holds one of these; all where there are none.
+        outcome: that the fault must have; "" for any that is not good.
     """
 
     name: str
@@ -34,6 +38,7 @@ class Planted:
     commands: tuple[str, ...]
     most: int = 0
     names: tuple[str, ...] = ()
+    outcome: Outcome | Literal[""] = ""
 
 
 FILES = "common/files.py"
@@ -96,6 +101,26 @@ PLANTED = [
         "SIGKILL at a system call",
         ("grasp-eval",),
         12,
+    ),
+    Planted(
+        "grasp-datagen forgets its shards",
+        "datagen/making.py",
+        "        manifest = _existing(folder) or fresh\n",
+        "        manifest = fresh\n",
+        "SIGKILL at a system call",
+        ("grasp-datagen, growing",),
+        12,
+        outcome="lost",
+    ),
+    Planted(
+        "a training ignores its checkpoints",
+        "train/session.py",
+        "            return run, newest_whole(run)\n",
+        "            return run, None\n",
+        "SIGKILL at a system call",
+        ("grasp-train",),
+        12,
+        outcome="lost",
     ),
     Planted(
         "metrics that cannot be written are left out",
@@ -263,13 +288,17 @@ def source_with(planted: Planted, folder: Path) -> Path:
 
 
 def found_by(planted: Planted, kind: Kind, work: Work) -> tuple[Fault, Tried] | None:
-    """Return a fault that turned red, or None where the defect was not found.
+    """Return a fault that turned red with the defect and not without it, or None where the defect was not found.
 
     Args:
         planted: the defect.
         kind: of the name that it asks for.
         work: with the sound code; its inputs are used.
     """
+    for name in MADE:  # with the sound code, before the other can
+        work.made(name)
+    for scenario in SCENARIOS:
+        stage_of(work).start(scenario)
     folder = work.folder / "planted" / "-".join(planted.name.split())
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("inputs", "starts"):
@@ -279,7 +308,10 @@ def found_by(planted: Planted, kind: Kind, work: Work) -> tuple[Fault, Tried] | 
     with Work(folder, source_with(planted, folder), work.shim) as broken:
         for fault in _asked(planted, list(kind.faults(broken, False))):
             tried = kind.tried(fault, broken)
-            if tried.outcome not in GOOD:
+            if tried.outcome not in GOOD and tried.outcome == (planted.outcome or tried.outcome):
+                sound = kind.tried(fault, work)
+                if sound.outcome not in GOOD:
+                    raise RuntimeError(f"{fault.name} is red without the defect, too: {sound.outcome}: {sound.said}")
                 return fault, tried
     return None
 

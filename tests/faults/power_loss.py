@@ -60,8 +60,12 @@ class File:
         if not self.since:
             return self.synced
         content = self.synced
-        for step in self.since[: draws.randint(0, len(self.since))]:
+        whole = draws.randint(0, len(self.since))
+        for step in self.since[:whole]:
             content = _changed(content, *step)
+        for place, data in self.since[whole : whole + 1]:
+            if data is not None and draws.random() < 0.5:  # the next write is torn
+                content = _changed(content, place, data[: draws.randint(0, len(data))])
         # A disk may also have kept the new length, and not the bytes.
         return content.ljust(len(self.content), b"\0") if draws.random() < 0.3 else content
 
@@ -212,15 +216,20 @@ class Committed:
                 content = self._waiting.pop(path)
                 self.files |= {path: content} if isinstance(content, bytes) else content
             return
-        for known in (self._waiting, self.files):
-            for path in [path for path in known if path == call.path or path.startswith(f"{call.path}/")]:
-                del known[path]
+        self._forget(call.path)
         if call.what == RENAME:
+            self._forget(call.other)  # until the folder is synced, the disk may have the old one or the new one
             what = self._disk.found(call.other)
             if isinstance(what, File):
                 self._waiting[call.other] = what.content
             elif what is not None:
                 self._waiting[call.other] = dict(files_of(what, f"{call.other}/"))
+
+    def _forget(self, gone: str) -> None:
+        """Drop what is known of a path, and of what lies below it."""
+        for known in (self._waiting, self.files):
+            for path in [path for path in known if path == gone or path.startswith(f"{gone}/")]:
+                del known[path]
 
     def missing(self, left: Folder) -> str | None:
         """Return what is not there; a file that has grown since may have lost what it has grown by."""
@@ -264,7 +273,7 @@ class PowerLoss:
                 gone = not_there(case, stage, scenario)
                 if gone is not None:
                     return Tried("lost", f"{gone}: not there after the command had ended well")
-            return gone_on(work.forked(scenario.argv, case), scenario, case, stage)
+            return gone_on(scenario, case, work)
 
 
 def not_there(case: Path, stage: Stage, scenario: Scenario) -> str | None:

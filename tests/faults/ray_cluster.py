@@ -3,12 +3,13 @@
 import contextlib
 import importlib.util
 import logging
+import signal
 import time
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from tests.faults.commands import Running, one_line
-from tests.faults.harness import Fault, Tried, Work
+from tests.faults.commands import Running
+from tests.faults.harness import Fault, NotHereError, Tried, Work
 from tests.faults.workers import COLLECT
 
 FAULTS = ("a node killed", "the head killed", "the object store full", "the command killed", "a Ray of its own")
@@ -17,14 +18,15 @@ _PATIENT = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "
 
 
 class Ray:
-    """Faults of a Ray cluster on this machine; none where Ray is not installed."""
+    """Faults of a Ray cluster on this machine."""
 
     name = "Ray"
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
         """Return each fault."""
-        there = importlib.util.find_spec("ray") is not None
-        for name in FAULTS if there and not short else ():
+        if importlib.util.find_spec("ray") is None:
+            raise NotHereError("Ray is not installed")
+        for name in () if short else FAULTS:
             yield Fault(self.name, "grasp-datagen", name)
 
     def tried(self, fault: Fault, work: Work) -> Tried:
@@ -42,6 +44,8 @@ class Ray:
                     running = Running(work, words, case)
                     running.until((case / COLLECT.result).exists)
                     time.sleep(3.0)
+                    if running.process.poll() is not None and not full:
+                        return Tried("silently wrong", f"the fault did not happen: ended; {running.ended().line}")
                     if fault.name == "a node killed":
                         cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
                     elif fault.name == "the head killed":
@@ -49,10 +53,11 @@ class Ray:
                     elif fault.name == "the command killed":
                         running.process.kill()
                     ended = running.ended()
+            killed = fault.name == "the command killed" and ended.rc == -signal.SIGKILL
             broken = ended.broken()
-            if broken is not None:
+            if broken is not None and not killed:
                 return broken
-            if ended.rc not in (0, 1, -9) and not one_line(ended):
+            if not killed and ended.rc != 0 and not (ended.rc == 1 and ended.line) and not ended.one_line:
                 return Tried("lost", f"exit status {ended.rc}: {ended.line}")
             after = COLLECT.goes_on(case, work)
             said = ended.rc not in (0, -9)

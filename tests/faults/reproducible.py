@@ -51,4 +51,4 @@ class Reproducible:
                 return broken or Tried("lost", ran.line)
             if fault.name == "--verify-replay" and "same bit for bit" not in ran.stdout:
                 return Tried("silently wrong", ran.stdout.strip())
-            return line.fits(case, work)
+            return line.fits(case, work, ran)

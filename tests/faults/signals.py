@@ -3,6 +3,7 @@
 import signal
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from tests.faults.commands import LINES, TRAIN, Line, Running
@@ -19,6 +20,7 @@ SENT = {
 # Seconds after the start: while Python starts, while modules are imported, and after the first thing was written.
 MOMENTS = ("importing", "beginning", "working")
 BETWEEN = 0.15
+LATER = (0.3, 0.0)  # seconds after the first sign of work; less where a command had ended by then
 
 
 class Signals:
@@ -37,33 +39,44 @@ class Signals:
         """Send them, wait for the end, and run the command again."""
         line = next(one for one in LINES if one.name == fault.command)
         sent, moment = fault.name.split(", ")
-        with line.case(work) as case:
-            running = Running(work, line.words, case)
-            _wait(running, line, case / line.result, moment)
-            for number in SENT[sent]:
-                running.send(number)
-                time.sleep(BETWEEN)
-            broken = _wrong(running.ended())
-            return broken if broken is not None else line.goes_on(case, work)
+        for later in LATER:
+            with line.case(work) as case:
+                running = Running(work, line.words, case)
+                _wait(running, line, case, moment, later)
+                met = running.process.poll() is None
+                for number in SENT[sent]:
+                    running.send(number)
+                    time.sleep(BETWEEN)
+                broken = _wrong(running.ended(), SENT[sent])
+                if broken is not None:
+                    return broken
+                after = line.goes_on(case, work)
+            if met or after.outcome != "survived":
+                return after
+        return replace(after, said="had ended before the signal came")
 
 
-def _wait(running: Running, line: Line, result: Path, moment: str) -> None:
+def _wait(running: Running, line: Line, case: Path, moment: str, later: float) -> None:
+    result = case / (line.result or "none")
     if moment == "importing":
         # Handlers of signals are there once Python has started; before that, the kernel's default ends the process.
         time.sleep(0.5)
     elif moment == "beginning":
         time.sleep(1.5)
-    elif line.result:
-        running.until(lambda: result.exists() or any(result.parent.glob(".tmp-*")))
-        time.sleep(0.3)
+    else:
+        running.until(lambda: result.exists() or any(result.parent.glob(".tmp-*")) or running.has_open(case))
+        time.sleep(later)
 
 
-def _wrong(ran: Ran) -> Tried | None:
+def _wrong(ran: Ran, sent: tuple[signal.Signals, ...]) -> Tried | None:
+    """Return what is wrong with the end of a command that got signals: it may have ended before, or by them."""
     if ran.hung:
         return Tried("hung", ran.line)
     if "Traceback" in ran.stderr or "Exception ignored" in ran.stderr:
         return Tried("traceback", ran.line)
-    return None
+    if ran.rc in (0, 130) or -ran.rc in sent or ran.rc - 128 in sent:
+        return None
+    return Tried("silently wrong", f"exit status {ran.rc}: {ran.line}")
 
 
 class Suspended:
@@ -81,7 +94,7 @@ class Suspended:
         line = next(one for one in LINES if one.name == fault.command)
         with line.case(work) as case:
             running = Running(work, line.words, case)
-            _wait(running, line, case / line.result, "working")
+            _wait(running, line, case, "working", LATER[0])
             for number in (signal.SIGSTOP, signal.SIGCONT):
                 running.send(number)
                 time.sleep(1.0)
@@ -89,4 +102,4 @@ class Suspended:
             broken = ended.broken()
             if broken is not None or ended.rc != 0:
                 return broken or Tried("lost", ended.line)
-            return line.fits(case, work)
+            return line.fits(case, work, ended)

@@ -104,7 +104,7 @@ def _sitting(hours: float, draws: random.Random) -> Iterator[dict[str, Any]]:
                     kills += more
                     differs = ran_out or difference(essence(case / result), usual[result])
                     wrong += [f"cycle {cycles}, {result}: {differs}"] if differs is not None else []
-                left = _left(folder / "temporary")
+                left = _left(work.temporary)
                 wrong += [f"cycle {cycles}: left {left}"] if left else []
                 rows.append(_answer(steady))
                 cycles += 1

@@ -71,7 +71,7 @@ class ClosedStreams:
             if broken is not None:
                 return broken
             if ran.rc == 0:
-                return line.fits(case, work)
+                return line.fits(case, work, ran if ran.stdout else None)
             if not any(words in fault.name for words in MAY_END):
                 return Tried("lost", f"exit status {ran.rc}: {ran.line}")
             after = line.goes_on(case, work)

@@ -2,12 +2,13 @@
 
 import os
 import shutil
-import subprocess
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
-from tests.faults.commands import LINES, MAKING, STUDY, TRAIN, Line, one_line
-from tests.faults.harness import HERE, Fault, Tried, Work
+from tests.faults.commands import LINES, MAKING, STUDY, TRAIN, Line
+from tests.faults.harness import HERE, Fault, NotHereError, Tried, Work
+from tests.faults.system_calls import NO_COMPILER, compiled
 
 LOCALES = {
     "LANG=C": {"LANG": "C", "LC_ALL": "C"},
@@ -105,7 +106,7 @@ def _elsewhere(name: str, line: Line, case: Path, work: Work) -> Tried:
         if ran.rc != 0:
             left = list((case / "real").iterdir())
             return Tried("lost", f"left {left[0]}") if left else Tried("detected", ran.line)
-        return line.fits(case, work) if result.is_symlink() else Tried("lost", "the link was replaced")
+        return line.fits(case, work, ran) if result.is_symlink() else Tried("lost", "the link was replaced")
     long = case / ("t" * 200)
     long.mkdir()
     return _run(line, case, work, {"TMPDIR": str(long)})
@@ -114,10 +115,10 @@ def _elsewhere(name: str, line: Line, case: Path, work: Work) -> Tried:
 def _named(line: Line, folder: Path) -> Line:
     """Return the command with its paths named from another working folder."""
     inside = Path("..") / folder if not folder.is_absolute() else folder
-    paths = {"objects", "data/regular-24", "runs/mc", "runs/online", "scores", "sweep", "study", "plan.toml", "runs"}
+    paths = {"objects", "data/regular-24", "runs/mc", "runs/online", "scores", "sweep", "study", "plan.toml"}
     paths |= {"report.html", "results", "page.md"}
     words = [str(inside / word) if word in paths else word for word in line.words[1:]]
-    return Line((line.words[0], *words), line.needs, line.result, line.made)
+    return replace(line, words=(line.words[0], *words))
 
 
 class Clock:
@@ -126,19 +127,23 @@ class Clock:
     name = "clock"
 
     def faults(self, work: Work, short: bool) -> Iterable[Fault]:
-        """Return each command with each clock; none where there is no C compiler."""
-        for line in () if short or shutil.which("cc") is None else LINES:
+        """Return each command with each clock."""
+        if self._library(work) is None:
+            raise NotHereError(NO_COMPILER)
+        for line in () if short else LINES:
             for how in CLOCKS:
                 yield Fault(self.name, line.name, how)
 
     def tried(self, fault: Fault, work: Work) -> Tried:
         """Run the command with that clock and compare."""
-        shim = work.folder / "clock.so"
-        if not shim.exists():
-            subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", shim, HERE / "clock.c", "-ldl"], check=True)
         line = _line(fault)
         with line.case(work) as case:
-            return _run(line, case, work, {"LD_PRELOAD": str(shim), "GRASPQ_CLOCK": fault.name})
+            return _run(line, case, work, {"LD_PRELOAD": str(self._library(work)), "GRASPQ_CLOCK": fault.name})
+
+    def _library(self, work: Work) -> Path | None:
+        with work.alone():
+            made = work.folder / "clock.so"
+            return made if made.exists() else compiled(HERE / "clock.c", work.folder)
 
 
 def _line(fault: Fault) -> Line:
@@ -153,12 +158,15 @@ def _move(case: Path, place: Path) -> None:
 
 
 def _run(line: Line, cwd: Path, work: Work, env: dict[str, str] | None = None, inside: Path | None = None) -> Tried:
-    """Run a command and compare what it makes, in the working folder unless `inside` says where."""
+    """Run a command and compare what it makes, in the working folder unless `inside` says where.
+
+    A name of a folder may be refused; a locale, a clock and a variable of the environment may not.
+    """
     new = env is not None
     ran = work.run(line.words, cwd, env=env) if new else work.forked(line.words, cwd)
     broken = ran.broken()
     if broken is not None:
         return broken
     if ran.rc != 0:
-        return Tried("detected" if one_line(ran) else "lost", ran.line)
-    return line.fits(inside if inside is not None else cwd, work)
+        return Tried("detected" if ran.one_line and not new else "lost", f"exit status {ran.rc}: {ran.line}")
+    return line.fits(inside if inside is not None else cwd, work, ran)

@@ -1,10 +1,14 @@
 """A process that has imported every command and forks one for each request: a fault does not pay for Python's start.
 
+Started with `lean`, it leaves the largest of what they import late to the commands, which then ask for that memory.
+
 Requests and answers are lines of JSON on the standard input and output that it is started with; see `Request`.
 """
 
+import atexit
 import contextlib
 import ctypes
+import gc
 import importlib
 import json
 import os
@@ -14,7 +18,9 @@ import select
 import signal
 import sys
 import tempfile
+import threading
 import time
+import traceback
 from typing import Any, NoReturn
 
 COMMANDS = {
@@ -35,22 +41,35 @@ LATE = (
     "graspq.studies.sweep.table", "graspq.studies.study.study", "graspq.studies.study.publishing",
     "graspq.report.page", "torch.utils.tensorboard", "graspq.evaluate.over_seeds",
 )  # fmt: skip
+# The same, not when lean. An optimizer of PyTorch imports `torch._dynamo` when it is first made, and a table of PyArrow
+# pandas: that takes longer than the small work of a fault.
+HEAVY = (
+    "torch._dynamo", "pandas", "matplotlib.backends.backend_agg", "PIL.PngImagePlugin", "PIL.PpmImagePlugin",
+    "PIL.BmpImagePlugin", "PIL.GifImagePlugin", "PIL.JpegImagePlugin", "graspq.evaluate.job_units",
+    "graspq.datasets.verify",
+)  # fmt: skip
 Request = dict[str, Any]  # argv, cwd, env, stdin, stdout, stderr (paths), seconds, limits (name -> bytes), armed
 
 
 def main() -> None:
     """Answer requests until there are no more."""
     sys.path.pop(0)  # this folder: names of ours must hide nobody's
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal, which is for who started this
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     nothing = os.open(os.devnull, os.O_RDWR)
     os.dup2(nothing, 0)
     os.dup2(nothing, 1)
-    for name in (*COMMANDS.values(), *LATE):
+    for name in (*COMMANDS.values(), *LATE, *(() if sys.argv[1:] == ["lean"] else HEAVY)):
         importlib.import_module(name)
     importlib.import_module("graspq.common.provenance").code_revision()
+    gc.collect()
+    gc.freeze()  # a child that collects garbage need not go through, and so copy, all that was imported
     print("ready", file=answers, flush=True)
-    for line in requests:
-        print(json.dumps(_answer(json.loads(line))), file=answers, flush=True)
+    with contextlib.suppress(SystemExit):
+        for line in requests:
+            print(json.dumps(_answer(json.loads(line))), file=answers, flush=True)
+    os._exit(0)  # nothing is left to do
 
 
 def _answer(request: Request) -> dict[str, Any]:
@@ -59,8 +78,12 @@ def _answer(request: Request) -> dict[str, Any]:
     if child == 0:
         _be(request)
     ended = os.pidfd_open(child)
-    with contextlib.closing(os.fdopen(ended)):
-        hung = not select.select([ended], [], [], request["seconds"])[0]
+    try:
+        with contextlib.closing(os.fdopen(ended)):
+            hung = not select.select([ended], [], [], request["seconds"])[0]
+    except SystemExit:
+        _kill_group(child)
+        raise
     # The child leads a group of its own: what it has started ends with it.
     if hung:
         _kill_group(child)
@@ -77,6 +100,8 @@ def _kill_group(leader: int) -> None:
 def _be(request: Request) -> NoReturn:
     """Become the process of a command; it ends as the command would."""
     os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
@@ -94,10 +119,38 @@ def _be(request: Request) -> NoReturn:
         resource.setrlimit(getattr(resource, name), (limit, limit))
     if request["armed"] is not None:
         _arm(**request["armed"])
-    if program in COMMANDS:
-        sys.exit(importlib.import_module(COMMANDS[program]).main(arguments, prog_name=program))
-    runpy.run_path(program, run_name="__main__")
-    sys.exit(0)
+    status = 0
+    try:
+        if program in COMMANDS:
+            importlib.import_module(COMMANDS[program]).main(arguments, prog_name=program)
+        else:
+            runpy.run_path(program, run_name="__main__")
+    except SystemExit as ending:
+        status = _status(ending.code)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    _end(status)
+
+
+def _status(code: object) -> int:
+    """Return the exit status that Python makes of the value of a SystemExit."""
+    if code is None or isinstance(code, int):
+        return (code or 0) & 0xFF
+    print(code, file=sys.stderr)
+    return 1
+
+
+def _end(status: int) -> NoReturn:
+    """End as Python does: wait for threads, call what asked for it, flush; but do not take all modules apart.
+
+    That last step took a second, most of it to copy the pages of what was imported, and does nothing to files.
+    """
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
 
 
 def _arm(under: str, mode: int, at: int, error: int, log: str, calls: int) -> None:

@@ -19,7 +19,6 @@ from tests.faults.commands import (
     Running,
     difference,
     essence,
-    one_line,
     training,
 )
 from tests.faults.harness import Fault, Tried, Work
@@ -108,7 +107,7 @@ def _together(pair: Pair, delay: float | None, work: Work) -> Tried:
             broken = ran.broken()
             if broken is not None:
                 return broken
-            if ran.rc != 0 and not one_line(ran):
+            if ran.rc != 0 and not ran.one_line:
                 return Tried("lost", f"exit status {ran.rc}: {ran.line}")
         if ended.rc != 0 and met.rc != 0:
             return Tried("lost", f"both refused: {ended.line}; {met.line}")

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from tests.faults.commands import EVAL, STUDY, SWEEP, Line, Running, one_line
+from tests.faults.commands import EVAL, STUDY, SWEEP, Line, Running
 from tests.faults.harness import MADE, Fault, Ran, Tried, Work
 
 # Two blocks of the usual size: grasp-datagen itself, with workers.
@@ -57,7 +57,9 @@ class Workers:
             temporary, env = Path(own), {"TMPDIR": own}
             running = Running(work, line.words, case, env)
             running.until(running.workers)
-            _do(fault.name, running)
+            if not _do(fault.name, running):
+                running.send(signal.SIGKILL)
+                return Tried("silently wrong", f"the fault did not happen: no such process; {running.ended().line}")
             if fault.name.startswith("the command killed"):
                 running.process.wait()
                 met = line.goes_on(case, work, env)  # while its worker is still ending
@@ -78,7 +80,9 @@ class Workers:
             return after if after.outcome != "survived" or ended.rc == 0 else Tried("detected", ended.line)
 
 
-def _do(what: str, running: Running) -> None:
+def _do(what: str, running: Running) -> bool:
+    """Do it; return whether there was a process to do it to."""
+
     def end(number: signal.Signals) -> bool:
         for worker in running.workers()[:1]:
             os.kill(worker, number)
@@ -87,10 +91,10 @@ def _do(what: str, running: Running) -> None:
 
     match what:
         case "SIGKILL at once":
-            end(signal.SIGKILL)
+            return end(signal.SIGKILL)
         case "SIGKILL later":
             time.sleep(2.0)
-            end(signal.SIGKILL)
+            return end(signal.SIGKILL)
         case "SIGKILL twice":
             seen: set[int] = set()
             while len(seen) < 2 and running.until(lambda: set(running.workers()) - seen):
@@ -98,31 +102,38 @@ def _do(what: str, running: Running) -> None:
                 for worker in set(running.workers()) - seen:
                     seen.add(worker)
                     _kill(worker, signal.SIGKILL)
+            return bool(seen)
         case "SIGSEGV" | "SIGTERM":
             time.sleep(1.0)
-            end(signal.Signals[what])
+            return end(signal.Signals[what])
         case "SIGSTOP for a while":
-            end(signal.SIGSTOP)
+            met = end(signal.SIGSTOP)
             time.sleep(2.0)
             end(signal.SIGCONT)
+            return met
         case "SIGSTOP and Ctrl-C":
-            end(signal.SIGSTOP)
+            met = end(signal.SIGSTOP)
             time.sleep(0.5)
             running.process.send_signal(signal.SIGINT)
             time.sleep(0.5)
             running.process.send_signal(signal.SIGINT)  # the first waits for the worker to keep what it has
+            return met
         case "too little memory":
-            for worker in running.workers()[:1]:
+            workers = running.workers()[:1]
+            for worker in workers:
                 size = int(Path(f"/proc/{worker}/statm").read_text().split()[0]) * resource.getpagesize()
                 resource.prlimit(worker, resource.RLIMIT_AS, (size + 2**20, size + 2**20))
+            return bool(workers)
         case "the server killed":
             for one in running.descendants():
                 if b"forkserver" in Path(f"/proc/{one}/cmdline").read_bytes():
                     _kill(one, signal.SIGKILL)
-                    break
+                    return True
         case "the command killed":
             time.sleep(1.0)
+            met = running.process.poll() is None
             running.process.kill()
+            return met
         case "the command killed, its worker slow":
             running.until(lambda: any(map(_holds_a_run, running.workers())), seconds=5.0)
             workers = running.workers()
@@ -130,11 +141,15 @@ def _do(what: str, running: Running) -> None:
                 _kill(worker, signal.SIGSTOP)
             running.process.kill()
             threading.Timer(SLOW_SECONDS, lambda: [_kill(worker, signal.SIGCONT) for worker in workers]).start()
+            return bool(workers)
         case "all killed":
             time.sleep(1.0)
+            met = running.process.poll() is None
             for one in running.descendants():
                 _kill(one, signal.SIGKILL)
             running.process.kill()
+            return met
+    return False
 
 
 def _kill(process: int, number: signal.Signals) -> None:
@@ -154,11 +169,12 @@ def _holds_a_run(worker: int) -> bool:
 
 
 def _wrong(what: str, ran: Ran) -> Tried | None:
+    if ran.rc == -signal.SIGKILL and what.startswith(("the command killed", "all killed")):
+        return None
     broken = ran.broken()
     if broken is not None:
         return broken
-    killed = what.startswith(("the command killed", "all killed")) and ran.rc == -signal.SIGKILL
-    if ran.rc in (0, 1, 130) or killed or one_line(ran):
+    if ran.rc in (0, 130) or ran.one_line or (ran.rc == 1 and ran.line):
         return None
     return Tried("lost", f"exit status {ran.rc}: {ran.line}")
 
