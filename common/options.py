@@ -26,6 +26,7 @@ from graspq.common.streams import (
     next_interrupt_ends_at_once,
     readers_are_gone,
     require_names_of_text,
+    was_interrupted,
     whole_streams,
 )
 
@@ -352,8 +353,11 @@ class _OneLineErrors:
         except click.ClickException as error:
             click.echo(f"error: {_one_line(error.format_message())}", err=True)
             sys.exit(error.exit_code)
-        except (OSError, MemoryError, RuntimeError, ImportError) as error:
+        except Exception as error:
             failure = failure_of_machine(error)
+            if failure is None and was_interrupted():
+                click.echo("interrupted", err=True)
+                sys.exit(INTERRUPTED)
             if failure is None:
                 raise
             click.echo(f"error: {_one_line(failure.message)}", err=True)

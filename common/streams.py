@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 
 import click
 
@@ -77,7 +77,8 @@ def require_names_of_text(words: Sequence[str]) -> None:
 
 def next_interrupt_ends_at_once() -> None:
     """Let another Ctrl-C end this process without a word: it is ending, and nobody would catch it."""
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is _USUAL:
+    usual = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, _interrupt)
+    if threading.current_thread() is threading.main_thread() and usual:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -89,7 +90,7 @@ def ended_in_order() -> Iterator[None]:
     """
     ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if ours:
-        signal.signal(signal.SIGTERM, _USUAL)
+        signal.signal(signal.SIGTERM, _interrupt)
     try:
         yield
     finally:
@@ -100,13 +101,26 @@ def ended_in_order() -> Iterator[None]:
 def interrupts_without_traceback() -> None:
     """Let a Ctrl-C while a script of ours is still importing say one word, as later on."""
     sys.excepthook = _say_interrupted
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
 
 
 def _say_interrupted(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    if issubclass(kind, KeyboardInterrupt):
+    if issubclass(kind, KeyboardInterrupt) or was_interrupted():
         click.echo("interrupted", err=True)
     else:
         sys.__excepthook__(kind, error, trace)
 
 
-_USUAL = signal.default_int_handler
+_signals: list[int] = []
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt and note it: a library that is importing may swallow that, and break on it later."""
+    _signals.append(number)
+    signal.default_int_handler(number, frame)
+
+
+def was_interrupted() -> bool:
+    """Return whether this process was asked to end, so that what fails now fails for that."""
+    return bool(_signals)

@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from graspq.common import streams
 from graspq.common.streams import ended_in_order
 
 # A command that prints what it is told, says how its descriptors are, opens a file and waits.
@@ -29,6 +30,12 @@ def main(words):
         print(word, flush=True)
         if word == "wait":
             time.sleep(60)
+        if word == "swallow":
+            try:
+                print("on", flush=True)
+                time.sleep(60)
+            except BaseException as error:  # as a library does with one that it may do without
+                raise TypeError("broken later") from error
         if word == "pipe":
             raise BrokenPipeError(32, "Broken pipe")
 main()
@@ -98,6 +105,27 @@ def test_an_interrupt_while_a_script_is_importing_is_one_word(tmp_path):
         assert process.communicate()[1] == "interrupted\n" and process.returncode == -signal.SIGINT
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_a_library_swallows_and_breaks_on_is_one_word_too(tmp_path, number):
+    with started(tmp_path, "swallow", stdout=subprocess.PIPE) as process:
+        assert [process.stdout.readline() for _ in range(2)] == ["swallow\n", "on\n"]
+        process.send_signal(number)
+        said = process.communicate()[1]
+    assert process.returncode == 130 and said.endswith("interrupted\n") and "Traceback" not in said
+    swallowed = """if True:
+        import graspq.common.options, time
+        try:
+            print("on", flush=True)
+            time.sleep(60)
+        except BaseException as error:
+            raise TypeError("broken later")
+    """
+    with started(tmp_path, before=swallowed, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == "on\n"
+        process.send_signal(signal.SIGINT)
+        assert process.communicate()[1] == "interrupted\n" and process.returncode == 1
+
+
 @pytest.mark.parametrize("ignored", ["", "signal.signal(signal.SIGINT, signal.SIG_IGN)"])
 def test_sigterm_ends_a_command_as_an_interrupt_does_in_the_background_too(tmp_path, ignored):
     with started(tmp_path, "wait", before=f"import signal\n{ignored}\n", stdout=subprocess.PIPE) as process:
@@ -110,7 +138,7 @@ def test_sigterm_ends_a_command_as_an_interrupt_does_in_the_background_too(tmp_p
 @pytest.mark.parametrize(
     ("before", "meanwhile"),
     [
-        (signal.SIG_DFL, signal.default_int_handler),
+        (signal.SIG_DFL, streams._interrupt),
         (signal.SIG_IGN, signal.SIG_IGN),
         (signal.getsignal, signal.getsignal),  # somebody's own
     ],

@@ -101,6 +101,7 @@ def _be(request: Request) -> NoReturn:
     """Become the process of a command; it ends as the command would."""
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    importlib.import_module("graspq.common.streams").interrupts_without_traceback()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.chdir(request["cwd"])
     os.environ.clear()
