@@ -44,10 +44,12 @@ class CommandLine:
     def call(self, log: Path) -> tuple[int, str]:
         """Run the command with its output in `log`; return its exit status and the last line that it wrote."""
         make_folder(log.parent)
-        with naming(log), _output_to(log):
-            print(f"$ {self}", flush=True)
-            status = self._status()
-        lines = [line.strip() for line in log.read_text(errors="replace").replace("\r", "\n").splitlines()]
+        with naming(log):
+            with _output_to(log):
+                print(f"$ {self}", flush=True)
+                status = self._status()
+            text = log.read_text(errors="replace")
+        lines = [line.strip() for line in text.replace("\r", "\n").splitlines()]
         last = next((line for line in reversed(lines) if line), "")
         return status, " ".join(last.removeprefix("error: ").split())
 

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from graspq.common.files import TEMPORARY_PREFIX
 from tests.faults.crash_points import few, gone_on, not_met, stage_of
 from tests.faults.harness import Fault, NotHereError, Ran, Tried, Work
 from tests.faults.system_calls import (
@@ -42,7 +43,7 @@ MOST = 12  # of each kind and command, evenly spread; more where they would miss
 IN_SHORT = ("EIO in write", "ENOSPC in open")  # the kinds that `make test` tries
 
 
-NAMED = re.compile(r"(?<![\w-])(new(-results)?[/:]|data/regular-24|runs/mc|objects/|page\.md|plan\.toml)")
+NAMED = re.compile(r"(?<![\w-])(new(-results)?[/:]|data/regular-24|runs/mc|objects/|page\.md|plan\.toml|recipe\.json)")
 
 
 def judged(ran: Ran, scenario: Scenario, case: Path, work: Work) -> Tried:
@@ -51,8 +52,10 @@ def judged(ran: Ran, scenario: Scenario, case: Path, work: Work) -> Tried:
     if broken is not None:
         return broken
     if ran.rc == 0:
-        differs = difference(compared(case), stage_of(work).unbroken(scenario).files)
-        return Tried("survived") if differs is None else Tried("silently wrong", differs)
+        # What it could not remove the next start removes, which is looked at by `gone_on`.
+        found = {name: one for name, one in compared(case).items() if TEMPORARY_PREFIX not in name}
+        differs = difference(found, stage_of(work).unbroken(scenario).files)
+        return gone_on(scenario, case, work) if differs is None else Tried("silently wrong", differs)
     if not ran.one_line:
         return Tried("silently wrong", f"exit status {ran.rc}, not one line: {ran.stderr[-300:]}")
     if not NAMED.search(ran.line) and not any(name in ran.line for name in (str(case), NO_MEMORY)):
