@@ -6,6 +6,7 @@ Losses stay on their device until a row is logged, so that a GPU never waits for
 import contextlib
 import math
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -26,6 +27,12 @@ BOUNDS = {"q": 10.0, "v": 10.0, "target": 10.0, "loss": 100.0}
 LOG_EVERY = 50
 
 
+def _all_but_writers(failed: threading.ExceptHookArgs) -> None:
+    """Print what fails in a thread, but for TensorBoard's writer: that hands its failure on, and it is told as ours."""
+    if not type(failed.thread).__module__.startswith("tensorboard."):
+        threading.__excepthook__(failed)
+
+
 class RunLog:
     """Collects losses and times between two rows of metrics; a context manager."""
 
@@ -35,6 +42,8 @@ class RunLog:
 
         self._run, self._batch_size, self._writes = run, settings.batch_size, writes
         self._folder = run.folder / "tensorboard"
+        if threading.excepthook is threading.__excepthook__:
+            threading.excepthook = _all_but_writers
         with naming(self._folder):
             self._writer = SummaryWriter(str(self._folder), purge_step=step + 1) if writes else None
         # A log file gets a line every half minute instead of a moving bar.

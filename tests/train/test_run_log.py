@@ -1,13 +1,15 @@
 """Divergence is seen at the step where it began, and values that no return can have count as divergence."""
 
 import re
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from graspq.train import loop
+from graspq.train import loop, run_log
 from graspq.train.checkpoint import load_acting
 from graspq.train.loop import train
 from graspq.train.networks.network import QNetwork
@@ -70,3 +72,28 @@ def test_a_run_whose_values_grow_out_of_reason_stops_and_keeps_the_checkpoint_be
     for network in loaded.networks.values():
         state = (image, step, torch.zeros(3, 4)) if isinstance(network, QNetwork) else (image, step)
         assert bool(network(*state).isfinite().all())
+
+
+def test_tensorboards_thread_says_nothing_of_a_failure_that_its_caller_is_told_and_other_threads_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tensorboard.summary.writer.event_file_writer import _AsyncWriter
+
+    class Full:
+        def write(self, data: bytes) -> None:
+            raise OSError(28, "No space left on device")
+
+        flush = close = lambda self: None
+
+    monkeypatch.setattr(threading, "excepthook", run_log._all_but_writers)
+    writer = _AsyncWriter(Full(), flush_secs=1)
+    with pytest.raises(OSError, match="No space left"):
+        for _ in range(100):
+            writer.write(b"row")
+            time.sleep(0.01)
+    writer._worker.join()
+    assert capsys.readouterr().err == ""
+    other = threading.Thread(target=Full().write, args=(b"",))
+    other.start()
+    other.join()
+    assert "No space left on device" in capsys.readouterr().err
