@@ -1,8 +1,8 @@
 """The claims of the paper, one by one, against the scores of studies: each holds, fails, is not decided or not tested.
 
 Each names its test; margins and levels are fixed here. They were written before version 2's `test` objects were opened,
-and made stricter when one of five seeds of the study at 10k was known: all rows that a claim speaks of must be there,
-and intervals are widened where one of many decides. Source: Quillen et al. 2018.
+and made stricter when one of five seeds of the study at 10k and four trainings of the second were known: all rows that
+a claim speaks of must be there, and intervals are widened where one of many decides. Source: Quillen et al. 2018.
 """
 
 import itertools

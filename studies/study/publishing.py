@@ -169,14 +169,13 @@ def row_table(rows: Rows, table: Table, reference: str | None = None) -> str:
         "p (Holm)",
     ]
     text = markdown([*heads, "discount", "steps", "recipe"], lines)
+    every = [(place, row) for place, here in asked_rows(table).items() for row in here.values()]
     failed = [
         f"`{row.name}` ({place}): {row.lacking}" + "".join(f"; {one}" for one in row.failures)
-        for place, here in asked_rows(table).items()
-        for row in here.values()
+        for place, row in every
         if row.failures
     ]
-    every = [row for here in asked_rows(table).values() for row in here.values()]
-    unbegun = sorted({row.name for row in every} - {row.name for row in every if row.rows or row.failures})
+    unbegun = sorted({row.name for _, row in every} - {row.name for _, row in every if row.rows or row.failures})
     text += "\nFailed: " + ". ".join(failed) + ".\n" if failed else ""
     return text + ("\nNot run: " + ", ".join(f"`{name}`" for name in unbegun) + ".\n" if unbegun else "")
 
@@ -200,7 +199,7 @@ def _row(place: Place, row: Scored, reference: Scored | None, compared: Compared
     mean, first = row.mean, row.rows[0]
     difference = ""
     if reference is not None and reference is not row:
-        found = row.less(reference)
+        found = compared.difference if compared is not None else row.less(reference)
         difference = difference_text(found) if row.several and reference.several else f"{found.value:+.3f}"
     p = p_text(compared.p_value) if compared is not None else ""
     size = place.size if place.setting == "off-policy" else f"{place.size}, {place.setting}"

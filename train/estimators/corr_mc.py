@@ -51,10 +51,10 @@ def target(
     Differs: 1. Q of an advantage is a constant of the loss; the released code lets gradient through it (`--judge
     online-gradient`, with `--preset paper`). 2. ν rises over half of the training; over a twentieth with `--preset
     paper`, which is the released code's 100,000 of 2 million steps (of other numbers: `--anneal` 100,000 / steps); the
-    text says "during training". 3. A batch counts
-    transitions; in the released code 32 counts episodes (`--batch-of episodes`, with `--preset paper`). 4. The lagged
-    network is copied every 50 steps, the paper's text for `dql`; every 100 in the released code, and with `--preset
-    paper`. 5. The discount is 0.8, the best that was measured (0.9 with `--preset paper`).
+    text says "during training". 3. A batch counts transitions; in the released code 32 counts episodes (`--batch-of
+    episodes`, with `--preset paper`). 4. The lagged network is copied every 50 steps, the paper's text for `dql`; every
+    100 in the released code, and with `--preset paper`. 5. The discount is 0.8, the best that was measured (0.9 with
+    `--preset paper`).
     """
     return _target(batch, later_values(batch, networks, settings, random), settings, progress)
 
