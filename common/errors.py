@@ -100,6 +100,21 @@ def naming(path: Path, instead: Path | None = None) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def said_of(where: Path | str) -> Iterator[None]:
+    """Let mistakes that are found inside name the file that they stand in, as far as they do not yet.
+
+    Args:
+        where: the file, and the place in it if need be.
+    """
+    try:
+        yield
+    except UserError as error:
+        if str(where) in error.message:
+            raise
+        raise type(error)(f"{where}: {error.message}") from None
+
+
 def refuse_other(folder: Path, what: str, theirs: Any, ours: Any, way_out: str) -> None:
     """Refuse a folder that holds something made with other settings, and name the first that differs.
 

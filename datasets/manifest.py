@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from graspq.common.action_space import ActionSpace, grasping
-from graspq.common.errors import UserError, refuse_other
+from graspq.common.errors import UserError, refuse_other, said_of
 from graspq.common.files import read_json, write_json
 
 FORMAT_VERSION = 2
@@ -211,7 +211,8 @@ class Manifest:
         if not isinstance(values, dict) or "format_version" not in values:
             raise UserError(f"{path}: not a dataset manifest; {REMEDY}")
         try:
-            return cls._checked(path, values)
+            with said_of(path):
+                return cls._checked(path, values)
         except UserError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:

@@ -33,6 +33,7 @@ ORPHAN_SECONDS = 3.0
 _SOCKET_ROOM = 80  # the path of a socket may have 107 bytes, its name in the folder has 18
 _SERVERS_ALLOWED = 3
 _SERVER_GONE = 255  # what multiprocessing says of a process whose server was killed
+_NOT_BEGUN = os.EX_OSERR
 _bench: Bench | None = None
 
 
@@ -92,7 +93,7 @@ class LocalWorker:
 
     def submit(self, unit: Any) -> "Future[Outcome[Any]]":
         """Give it a unit."""
-        future: Future[Outcome[Any]] = self._executor.submit(_do, unit)
+        future: Future[Outcome[Any]] = self._executor.submit(_do, _Packed(unit))
         return future
 
     def outcome(self, future: "Future[Outcome[Any]]") -> Outcome[Any]:
@@ -222,6 +223,8 @@ def _how(exit_code: int | None) -> str:
         return "its process ended"
     if exit_code < 0:
         return f"killed by {signal.Signals(-exit_code).name}"
+    if exit_code == _NOT_BEGUN:
+        return "could not begin: too little memory or too many processes"
     return f"exit code {exit_code}"
 
 
@@ -232,8 +235,11 @@ def _begin(work: bytes, environment: dict[str, str]) -> None:
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.path.append(str(Path.cwd()))  # for modules that the user names, at the end so that none is shadowed
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _bench = Bench(lambda: pickle.loads(work), lambda folder: folder)
+    try:
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+    except RuntimeError:  # no thread can be had; the executor would print a traceback
+        os._exit(_NOT_BEGUN)
+    _bench = Bench(lambda: pickle.loads(work), lambda folder: folder, pickle.loads)
     multiprocessing.util.Finalize(None, _bench.close, exitpriority=0)
 
 
@@ -250,6 +256,20 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _do(unit: Any) -> Outcome[Any]:
+class _Packed:
+    """A unit that arrives as bytes.
+
+    What fails while it is unpickled, and modules are imported for it, fails as the unit does. The executor would end
+    the worker with a traceback.
+    """
+
+    def __init__(self, unit: Any) -> None:
+        self._unit = unit
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return bytes, (pickle.dumps(self._unit),)
+
+
+def _do(packed: bytes) -> Outcome[Any]:
     assert _bench is not None
-    return _bench.do(unit)
+    return _bench.do(packed)

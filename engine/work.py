@@ -78,14 +78,17 @@ Outcome = Done[R] | Mistake | Failed | Died
 class Bench:
     """The state of one worker: the work is opened at the first unit and stays open."""
 
-    def __init__(self, fetch_work: Callable[[], Work[Any, Any]], place: Place) -> None:
+    def __init__(
+        self, fetch_work: Callable[[], Work[Any, Any]], place: Place, unpack: Callable[[Any], Any] = lambda unit: unit
+    ) -> None:
         """Prepare; nothing that can fail happens before the first unit.
 
         Args:
             fetch_work: returns the work.
             place: see `Work.open`.
+            unpack: returns a unit as it is of what `do` is given.
         """
-        self._fetch_work, self._place = fetch_work, place
+        self._fetch_work, self._place, self._unpack = fetch_work, place, unpack
         self._stack = contextlib.ExitStack()
         self._do: Callable[[Any], Any] | None = None
 
@@ -98,7 +101,7 @@ class Bench:
         try:
             if self._do is None:
                 self._do = self._stack.enter_context(self._fetch_work().open(self._place))
-            return Done(self._do(unit))
+            return Done(self._do(self._unpack(unit)))
         except UserError as error:
             return Mistake(error.message)
         except KeyboardInterrupt:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, said_of
 from graspq.common.files import LOCK_NAME, locked, remove_temporaries, writable_folder
 from graspq.common.named_objects import source_digest
 from graspq.common.provenance import code_revision, versions
@@ -147,7 +147,9 @@ def _task_and_objects(job: Job, run: "RunPolicy | None", beside: Sequence[Prepar
     """Return what a job's scenes are made of."""
     name = job.task or (str(run.origin.task["name"]) if run is not None else _common_task(beside))
     if run is not None and run.origin.task["name"] == name:
-        task, config = task_from_json(run.origin.task), run.origin.config
+        config = run.origin.config
+        with said_of(f"{job.run}, its config.json"):
+            task = task_from_json(run.origin.task)
         return task, find_object_set(task, job.objects, object_set_of(config), datasets_of(config))
     same = [other for other in beside if other.run is not None and other.task.settings.name == name]
     task = same[0].task if same and run is None else task_named(name)

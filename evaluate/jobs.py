@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, said_of
 from graspq.common.files import read_toml
 from graspq.common.options import MOST
 from graspq.evaluate.records import ORACLE, RANDOM
@@ -90,10 +90,8 @@ def read_jobs(path: Path, settings: EvalSettings) -> list[Job]:
         merged = {**content, **table}
         where = f"{path}, job table {number}"
         _check_keys(merged, where)
-        try:
+        with said_of(where):
             jobs += _product(merged, settings)
-        except UserError as error:
-            raise UserError(f"{where}: {error.message}") from None
     return list(dict.fromkeys(jobs))
 
 

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from graspq.common.checksums import DamagedError
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, said_of
 from graspq.common.files import committed_folder, content_of, read_json
 from graspq.train.estimators import estimator_named
 from graspq.train.networks import build
@@ -126,7 +126,8 @@ def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
     run = Run.open(path.absolute().parent.parent if given else path)
     checkpoint = path if given and step is None else run.checkpoint(step)
     description = describe(checkpoint)
-    specification = NetworkSpecification.from_json(description["network"])
+    with said_of(checkpoint / STATE_FILE):
+        specification = NetworkSpecification.from_json(description["network"])
     if run.config.get("network") != description["network"]:
         raise UserError(
             f"{checkpoint}: of another network than its run: config.json says {run.config.get('network')}, "
@@ -135,7 +136,8 @@ def load_acting(path: Path | str, step: int | None = None) -> LoadedRun:
     algo = run.config["settings"].get("algo")
     if not isinstance(algo, str):
         raise UserError(f"{run.folder / 'config.json'}: names no estimator (settings.algo); copy the run again")
-    makers = estimator_named(algo).parts
+    with said_of(run.folder / "config.json"):
+        makers = estimator_named(algo).parts
     networks: dict[str, nn.Module] = {}
     names = []
     for part in description["parts"]:

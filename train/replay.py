@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
+from graspq.common.errors import UserError, said_of
 from graspq.common.files import temporary_folder
 from graspq.datasets.dataset import open_shards
 from graspq.train.loop import train
@@ -72,7 +72,8 @@ def replay(
     recorded = _rows(run)
     if not recorded:
         raise UserError(f"{folder}: has no metrics of its first {REPLAYED_STEPS} steps; let grasp-train run on")
-    settings = TrainSettings.from_json(run.config["settings"])
+    with said_of(run.folder / "config.json"):
+        settings = TrainSettings.from_json(run.config["settings"])
     changed: dict[str, Any] = {"shards": tuple(shards)} if shards else {}
     changed |= {"threads": threads} if threads is not None else {}
     settings = dataclasses.replace(settings, **changed)

@@ -1,5 +1,6 @@
 """A cell of a study's table, a unit of its plan: one row trained on one dataset with one seed, and scored."""
 
+import contextlib
 import functools
 import re
 from collections.abc import Sequence
@@ -7,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graspq.common.errors import UserError
+import click
+
+from graspq.common.errors import UserError, said_of
 from graspq.common.machine import available_cores
 from graspq.common.options import given_options, parse_count
 from graspq.evaluate.recipe_digest import deciding
@@ -28,11 +31,13 @@ class Cell(Trial):
         row: name of the row.
         task: name of the task.
         size: size of the dataset, as the plan writes it.
+        plan: file of the plan.
     """
 
     row: str
     task: str
     size: str
+    plan: Path
 
     @property
     def name(self) -> str:
@@ -47,10 +52,14 @@ class Cell(Trial):
             UserError: the row has no such option.
         """
         known = training_options(self.algo, self.settings.on_policy, self.options)
-        for name, _ in self.options:
-            if name not in known:
-                raise UserError(f"{self.row}: no option {name} of training with {self.algo}; see grasp-train --help")
-        return super().training_command()
+        with self._said_of_row():
+            for name, _ in self.options:
+                if name not in known:
+                    raise UserError(f"no option {name} of training with {self.algo}; see grasp-train --help")
+            return super().training_command()
+
+    def _said_of_row(self) -> contextlib.AbstractContextManager[None]:
+        return said_of(f"{self.plan}, row {self.row}")
 
     @functools.cached_property
     def deciding(self) -> dict[str, Any]:
@@ -59,8 +68,16 @@ class Cell(Trial):
         Raises:
             UserError: the row has no such option, or a value is out of range.
         """
+        with self._said_of_row():
+            return self._deciding()
+
+    def _deciding(self) -> dict[str, Any]:
         command = self.training_command()
-        given = given_options(command.main.make_context(command.script, list(command.arguments)))
+        try:
+            context = command.main.make_context(command.script, list(command.arguments))
+        except click.UsageError as error:  # it tells of a command line, which nobody has typed
+            raise UserError(error.format_message()) from None
+        given = given_options(context)
         if self.settings.on_policy:
             # Imported late: it needs the simulator.
             from graspq.studies.online.resolve import resolve
@@ -93,8 +110,9 @@ def cells_of(plan: StudyPlan, folder: Path, *, workers: int | None = None, devic
     found = []
     for seed in range(plan.values["seeds"]):
         for row, task, size in columns:
-            settings = _settings(plan, folder, row, task, size, workers, device)
-            found.append(Cell(settings, row.algo, row.options, seed, row.name, task, size))
+            with said_of(plan.path):
+                settings = _settings(plan, folder, row, task, size, workers, device)
+            found.append(Cell(settings, row.algo, row.options, seed, row.name, task, size, plan.path))
     return found
 
 

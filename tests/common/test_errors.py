@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 import pytest
 
-from graspq.common.errors import MachineError, UserError, failure_of_machine, naming, refuse_other
+from graspq.common.checksums import DamagedError
+from graspq.common.errors import MachineError, UserError, failure_of_machine, naming, refuse_other, said_of
 from graspq.common.files import committed
 from graspq.common.options import Command
 from graspq.datasets.blocks import readable
@@ -48,6 +49,11 @@ def test_a_failed_write_names_the_file_that_it_was_for_and_not_its_temporary_nam
     with pytest.raises(OSError) as error, naming(path, path):
         raise OSError(errno.EIO, "", str(tmp_path / "other"))
     assert error.value.filename == str(tmp_path / "other")
+
+
+def test_a_mistake_names_the_file_that_it_stands_in_once() -> None:
+    with pytest.raises(DamagedError, match=r"^plan\.toml: no such row$"), said_of("plan.toml"), said_of("plan.toml"):
+        raise DamagedError("no such row")
 
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that answers EIO")

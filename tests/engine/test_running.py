@@ -6,7 +6,7 @@ import signal
 
 import pytest
 from ending import end_in_the_middle, opened
-from units_of_work import Squares
+from units_of_work import Squares, TooLarge
 
 from graspq.common.errors import MachineError, UserError
 from graspq.engine import EngineSettings, run
@@ -75,6 +75,12 @@ def test_a_failure_of_the_machine_is_one_in_the_parent_too_and_no_mistake_of_the
     with pytest.raises(MachineError) as raised:
         list(run(Squares(), ["full", ("sleep", 0.1)], local(workers)))
     assert raised.value.message == "data: the disk is full" and not isinstance(raised.value, UserError)
+
+
+def test_too_little_memory_for_the_unit_itself_is_a_failure_of_the_machine_without_a_traceback(capfd):
+    with pytest.raises(MachineError, match="not enough memory"):
+        list(run(Squares(), [TooLarge()], local(1)))
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_defect_carries_its_traceback():

@@ -67,6 +67,17 @@ class Squares:
         return unit * unit
 
 
+def cannot_be_unpickled():
+    raise MemoryError
+
+
+class TooLarge:
+    """A unit for which a worker has too little memory before it has begun."""
+
+    def __reduce__(self):
+        return cannot_be_unpickled, ()
+
+
 @dataclass(frozen=True)
 class ReadsFolder:
     """Reads files of a folder; says from where."""

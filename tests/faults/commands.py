@@ -138,15 +138,16 @@ def _told(said: str) -> str:
     return said.strip().rpartition(": ")[2]
 
 
-def _of(made: str, *needs: str) -> Line:
+def line_of(made: str, *needs: str) -> Line:
+    """Return the command that makes an input of the harness, and what it needs."""
     return Line(tuple(shlex.split(MADE[made][1][-1])), needs, MADE[made][0], made)
 
 
-OBJECTS, DATAGEN, TRAIN = _of("objects"), _of("dataset", "objects"), _of("run", "dataset")
-EVAL, SWEEP = _of("evaluation", "dataset", "run"), _of("sweep", "dataset")
-STUDY = replace(_of("study", "dataset"), beside=("results", "page.md", "recipe.json"))
-ONLINE = _of("online", "dataset", "run")
-REPORT = _of("report", "dataset", "run", "evaluation")
+OBJECTS, DATAGEN, TRAIN = line_of("objects"), line_of("dataset", "objects"), line_of("run", "dataset")
+EVAL, SWEEP = line_of("evaluation", "dataset", "run"), line_of("sweep", "dataset")
+STUDY = replace(line_of("study", "dataset"), beside=("results", "page.md", "recipe.json"))
+ONLINE = line_of("online", "dataset", "run")
+REPORT = line_of("report", "dataset", "run", "evaluation")
 VERIFY = Line(("grasp-data", "verify", "data/regular-24", "--workers", "0"), ("dataset",), says=True)
 LINES = (OBJECTS, DATAGEN, TRAIN, EVAL, SWEEP, STUDY, ONLINE, REPORT, VERIFY)
 MAKING = (OBJECTS, DATAGEN, TRAIN, EVAL, SWEEP, STUDY, ONLINE)
@@ -263,7 +264,7 @@ class Running:
         )
         work.started[:] = [*(one for one in work.started if one.poll() is None), self.process]
 
-    def until(self, there: Callable[[], Any], seconds: float = 60.0) -> bool:
+    def until(self, there: Callable[[], Any], seconds: float = SECONDS) -> bool:
         """Wait until something is there, or the command has ended; return whether it still runs."""
         until = time.monotonic() + seconds
         while self.process.poll() is None and not there() and time.monotonic() < until:

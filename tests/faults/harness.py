@@ -189,6 +189,7 @@ MADE: dict[str, tuple[str, tuple[str, ...]]] = {
 NEEDS = {
     "dataset": ("objects",), "run": ("dataset",), "evaluation": ("run",), "online": ("run",), "report": ("evaluation",),
     "sweep": ("dataset",), "study": ("dataset",), "collection": ("objects",),
+    "longer evaluation": ("run",),
 }  # fmt: skip
 BESIDE = ("plan.toml", "recipe.json", "results", "page.md")  # of the study
 

@@ -684,7 +684,7 @@ class Hostile:
         reads, content = PLANS[what]
         with work.copy("dataset", "objects") as case:
             (case / "hostile.toml").write_text(content, errors="surrogateescape")
-            return _refused(READS[reads].split(), case, work, ("hostile.toml", "--", "policy "))
+            return _refused(READS[reads].split(), case, work, ("hostile.toml", "policy no_such_module"))
 
     def _import(self, what: str, work: Work) -> Tried:
         with work.copy() as case:
@@ -741,12 +741,12 @@ class Runs:
 
 PICKLE = b"cos\nsystem\n(S'touch ran'\ntR."
 ROOM = 2**30  # bytes of address space that a command gets besides what it has when it begins
-# What a refusal names: the file or its folder, or the setting in it that cannot be.
+# What a refusal names: the file or its folder.
 NAMES = {
     "object set": ("objects",), "object set of a stranger, signed": ("objects",),
-    "manifest": ("data/regular-24", "action space"), "shard": ("data/regular-24",), "episodes": ("data/regular-24",),
-    "weights": ("runs/mc",), "checkpoint": ("runs/mc", "network specification"),
-    "run": ("runs/mc", "--algo", "task ", "time_step"), "run in a report": ("runs/mc",),
+    "manifest": ("data/regular-24",), "shard": ("data/regular-24",), "episodes": ("data/regular-24",),
+    "weights": ("runs/mc",), "checkpoint": ("runs/mc",),
+    "run": ("runs/mc",), "run in a report": ("runs/mc",),
     "evaluation in a report": ("scores",), "table of a sweep": ("sweep",), "plan of a sweep": ("sweep",),
     "frozen recipe": ("recipe.json",),
 }  # fmt: skip

@@ -10,13 +10,18 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from tests.faults.commands import EVAL, STUDY, SWEEP, Line, Running
+from tests.faults.commands import STUDY, SWEEP, Line, Running, line_of
 from tests.faults.harness import MADE, Fault, Ran, Tried, Work
 
-# Two blocks of the usual size: grasp-datagen itself, with workers.
-_COLLECT = "grasp-datagen --size 30 --objects objects --out data/regular-30 --seed 0 --workers"
-MADE["collection"] = ("data/regular-30", (f"{_COLLECT} 0",))
-COLLECT = Line((*_COLLECT.split(), "1"), ("objects",), "data/regular-30", "collection")
+# Blocks and tasks of the usual sizes, and enough of them that a worker is still at work when its fault comes.
+MADE["collection"] = (
+    "data/regular-60",
+    ("grasp-datagen --size 60 --objects objects --out data/regular-60 --seed 0 --workers 0",),
+)
+MADE["longer evaluation"] = (
+    "more-scores",
+    ("grasp-eval runs/mc --episodes 40 --films 1 --workers 0 --device cpu --out more-scores",),
+)
 
 
 def _with_workers(line: Line) -> Line:
@@ -25,7 +30,10 @@ def _with_workers(line: Line) -> Line:
     return replace(line, words=tuple(words))
 
 
-LINES = {line.name: line for line in (COLLECT, *map(_with_workers, (EVAL, SWEEP, STUDY)))}
+COLLECT = line_of("collection", "objects")
+LINES = {
+    line.name: _with_workers(line) for line in (COLLECT, line_of("longer evaluation", "dataset", "run"), SWEEP, STUDY)
+}
 FAULTS = (
     "SIGKILL at once", "SIGKILL later", "SIGKILL twice", "SIGSEGV", "SIGTERM", "SIGSTOP for a while",
     "SIGSTOP and Ctrl-C", "too little memory", "the server killed", "the command killed",
@@ -34,6 +42,9 @@ FAULTS = (
 # Failures are noted in their table, and not tried again unless asked.
 NOTING = ("grasp-sweep", "grasp-study")
 LEFT_SECONDS = 20.0
+# CPU time, as fast machines and slow ones differ: of a worker that has begun, not a child that its server has for a
+# moment while it imports, and of one in the midst of its unit.
+BEGUN_SECONDS, WORKED_SECONDS = 0.02, 0.3
 SLOW_SECONDS = 6.0  # that a worker outlives its command; less than the next start waits for a folder
 
 
@@ -56,8 +67,8 @@ class Workers:
         with line.case(work) as case, tempfile.TemporaryDirectory(prefix="faults-", dir="/tmp") as own:
             temporary, env = Path(own), {"TMPDIR": own}
             running = Running(work, line.words, case, env)
-            running.until(running.workers)
-            if not _do(fault.name, running):
+            running.until(lambda: _at_work(running, BEGUN_SECONDS))
+            if not _do(fault.name, running, line.name in NOTING):
                 running.send(signal.SIGKILL)
                 return Tried("silently wrong", f"the fault did not happen: no such process; {running.ended().line}")
             if fault.name.startswith("the command killed"):
@@ -80,32 +91,35 @@ class Workers:
             return after if after.outcome != "survived" or ended.rc == 0 else Tried("detected", ended.line)
 
 
-def _do(what: str, running: Running) -> bool:
-    """Do it; return whether there was a process to do it to."""
+def _do(what: str, running: Running, trains: bool) -> bool:
+    """Do it; return whether there was a process to do it to.
+
+    Args:
+        what: the fault.
+        running: the command.
+        trains: whether its workers train, and hold the lock of what they train.
+    """
 
     def end(number: signal.Signals) -> bool:
         for worker in running.workers()[:1]:
-            os.kill(worker, number)
-            return True
+            return _kill(worker, number)
         return False
 
     match what:
         case "SIGKILL at once":
             return end(signal.SIGKILL)
         case "SIGKILL later":
-            time.sleep(2.0)
-            return end(signal.SIGKILL)
+            return running.until(lambda: _at_work(running)) and end(signal.SIGKILL)
         case "SIGKILL twice":
             seen: set[int] = set()
             while len(seen) < 2 and running.until(lambda: set(running.workers()) - seen):
                 time.sleep(0.3)
                 for worker in set(running.workers()) - seen:
-                    seen.add(worker)
-                    _kill(worker, signal.SIGKILL)
-            return bool(seen)
+                    if _kill(worker, signal.SIGKILL):
+                        seen.add(worker)
+            return len(seen) == 2
         case "SIGSEGV" | "SIGTERM":
-            time.sleep(1.0)
-            return end(signal.Signals[what])
+            return running.until(lambda: _at_work(running)) and end(signal.Signals[what])
         case "SIGSTOP for a while":
             met = end(signal.SIGSTOP)
             time.sleep(2.0)
@@ -130,12 +144,11 @@ def _do(what: str, running: Running) -> bool:
                     _kill(one, signal.SIGKILL)
                     return True
         case "the command killed":
-            time.sleep(1.0)
-            met = running.process.poll() is None
+            met = running.until(lambda: _at_work(running))
             running.process.kill()
             return met
         case "the command killed, its worker slow":
-            running.until(lambda: any(map(_holds_a_run, running.workers())), seconds=5.0)
+            running.until(lambda: any(map(_holds_a_run, running.workers())) if trains else _at_work(running))
             workers = running.workers()
             for worker in workers:
                 _kill(worker, signal.SIGSTOP)
@@ -143,8 +156,7 @@ def _do(what: str, running: Running) -> bool:
             threading.Timer(SLOW_SECONDS, lambda: [_kill(worker, signal.SIGCONT) for worker in workers]).start()
             return bool(workers)
         case "all killed":
-            time.sleep(1.0)
-            met = running.process.poll() is None
+            met = running.until(lambda: _at_work(running))
             for one in running.descendants():
                 _kill(one, signal.SIGKILL)
             running.process.kill()
@@ -152,11 +164,26 @@ def _do(what: str, running: Running) -> bool:
     return False
 
 
-def _kill(process: int, number: signal.Signals) -> None:
+def _kill(process: int, number: signal.Signals) -> bool:
+    """Send a signal; return whether the process was there."""
     try:
         os.kill(process, number)
     except ProcessLookupError:
-        return
+        return False
+    return True
+
+
+def _at_work(running: Running, seconds: float = WORKED_SECONDS) -> bool:
+    """Return whether a worker has spent so much CPU time."""
+    return any(_cpu_seconds(worker) >= seconds for worker in running.workers())
+
+
+def _cpu_seconds(process: int) -> float:
+    try:
+        stat = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _holds_a_run(worker: int) -> bool:

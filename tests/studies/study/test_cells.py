@@ -51,5 +51,8 @@ def test_the_search_of_a_plan_is_that_of_its_scores_and_part_of_the_recipe(plan:
 
 def test_an_option_that_a_row_does_not_have_is_refused_by_name(plan: Callable[..., Any]) -> None:
     _, (cell, *_) = plan(('"mc",', '{algo = "mc", nu = 1},'))
-    with pytest.raises(UserError, match="mc-nu1: no option nu of training with mc"):
+    with pytest.raises(UserError, match=r"^\S*\.toml, row mc-nu1: no option nu of training with mc"):
         cell.training_command()
+    _, (cell, *_) = plan(('"mc",', '{algo = "mc", learning_rate = "fast"},'))
+    with pytest.raises(UserError, match=r"^\S*\.toml, row mc-learningratefast: .*'fast' is not a valid float"):
+        _ = cell.digest
