@@ -189,7 +189,7 @@ MADE: dict[str, tuple[str, tuple[str, ...]]] = {
 NEEDS = {
     "dataset": ("objects",), "run": ("dataset",), "evaluation": ("run",), "online": ("run",), "report": ("evaluation",),
     "sweep": ("dataset",), "study": ("dataset",), "collection": ("objects",),
-    "longer evaluation": ("run",),
+    "longer evaluation": ("run",), "collection for Ray": ("objects",),
 }  # fmt: skip
 BESIDE = ("plan.toml", "recipe.json", "results", "page.md")  # of the study
 

@@ -8,10 +8,16 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from tests.faults.commands import Running
-from tests.faults.harness import Fault, NotHereError, Tried, Work
-from tests.faults.workers import COLLECT
+from tests.faults.commands import Running, line_of
+from tests.faults.harness import MADE, Fault, NotHereError, Tried, Work
+from tests.faults.workers import with_a_worker
 
+# So many that it still runs when the fault comes.
+MADE["collection for Ray"] = (
+    "data/regular-120",
+    ("grasp-datagen --size 120 --objects objects --out data/regular-120 --seed 0 --workers 0",),
+)
+COLLECT = with_a_worker(line_of("collection for Ray", "objects"))
 FAULTS = ("a node killed", "the head killed", "the object store full", "the command killed", "a Ray of its own")
 _STORE = 80 * 2**20
 _PATIENT = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}

@@ -24,7 +24,8 @@ MADE["longer evaluation"] = (
 )
 
 
-def _with_workers(line: Line) -> Line:
+def with_a_worker(line: Line) -> Line:
+    """Return a command with one worker."""
     words = list(line.words)
     words[words.index("--workers") + 1] = "1"
     return replace(line, words=tuple(words))
@@ -32,7 +33,7 @@ def _with_workers(line: Line) -> Line:
 
 COLLECT = line_of("collection", "objects")
 LINES = {
-    line.name: _with_workers(line) for line in (COLLECT, line_of("longer evaluation", "dataset", "run"), SWEEP, STUDY)
+    line.name: with_a_worker(line) for line in (COLLECT, line_of("longer evaluation", "dataset", "run"), SWEEP, STUDY)
 }
 FAULTS = (
     "SIGKILL at once", "SIGKILL later", "SIGKILL twice", "SIGSEGV", "SIGTERM", "SIGSTOP for a while",
