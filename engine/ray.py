@@ -212,7 +212,7 @@ def _actor_class() -> type:
             sys.path = [*(path for path in sys.path if path != caller_folder), caller_folder]
             from graspq.engine.ray import Member
 
-            self._member = Member(*arguments)
+            self._member = Member(caller_folder, *arguments)
 
         def node(self) -> str:
             return self._member.node
@@ -234,10 +234,11 @@ class Member:
         bench: the state.
     """
 
-    def __init__(self, work: list[Any], shipped: dict[str, tuple[str, Any]], home: str) -> None:
+    def __init__(self, caller_folder: str, work: list[Any], shipped: dict[str, tuple[str, Any]], home: str) -> None:
         """Prepare.
 
         Args:
+            caller_folder: working folder of the process that hands out the units, which need not be this one's.
             work: reference of the `Work`, in a list so that it is fetched late.
             shipped: folder -> digest and reference of its packed content.
             home: node of the process that hands out the units: there the folders themselves are at hand.
@@ -246,6 +247,6 @@ class Member:
 
         def place(folder: Path) -> Path:
             digest, reference = shipped[str(folder)]
-            return folder if self.node == home else received(digest, lambda: ray.get(reference))
+            return Path(caller_folder, folder) if self.node == home else received(digest, lambda: ray.get(reference))
 
         self.bench = Bench(lambda: ray.get(work[0]), place)

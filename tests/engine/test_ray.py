@@ -3,6 +3,7 @@
 import logging
 import signal
 import time
+from pathlib import Path
 
 import pytest
 from ending import end_in_the_middle
@@ -61,13 +62,21 @@ def test_mistakes_and_defects_are_those_of_the_local_engine(on_cluster):
         list(run(Squares(), ["defect"], on_cluster, name=lambda unit: f"unit {unit}"))
 
 
-def test_a_node_elsewhere_reads_its_own_copy_of_a_folder(on_cluster, tmp_path):
+@pytest.mark.parametrize("named", ["absolute", "relative to the caller's working folder"])
+def test_a_node_elsewhere_reads_its_own_copy_of_a_folder(on_cluster, tmp_path, monkeypatch, named):
+    monkeypatch.chdir(tmp_path)  # that of nobody else in the cluster
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "a").write_text(f"content {time.time()}")
-    results = [result for _, result in run(ReadsFolder(folder), ["a"] * 4, on_cluster)]
-    assert {text for _, text, _ in results} == {(folder / "a").read_text()}
-    places = {place for place, _, _ in results}
+    given = folder if named == "absolute" else Path("folder")
+    places = set()
+    results = run(ReadsFolder(given), ["a"] * 200, on_cluster)
+    for _, (place, text, _) in results:
+        assert text == (folder / "a").read_text()
+        places.add(place)
+        if len(places) == 2:  # a node may begin late
+            break
+    results.close()
     assert str(folder) in places and len(places) == 2
 
 
