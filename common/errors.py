@@ -63,8 +63,12 @@ def failure_of_machine(error: BaseException) -> MachineError | None:
         return MachineError(f"{where}{os.strerror(error.errno)}; {_REMEDIES[error.errno]}")
     if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         return MachineError("not enough memory or threads; free some, or lift their limits, then run the command again")
-    # PyTorch says so with a RuntimeError, a library that is imported with an ImportError.
-    said = {RuntimeError: "can't allocate memory", ImportError: "failed to map segment"}
+    # PyTorch says so with a RuntimeError, a library that is imported with an ImportError, pyarrow with nothing where it
+    # has no memory to import pandas.
+    said = {
+        RuntimeError: "can't allocate memory", ImportError: "failed to map segment",
+        SystemError: "error return without exception set",
+    }  # fmt: skip
     if isinstance(error, MemoryError) or any(isinstance(error, kind) and said[kind] in str(error) for kind in said):
         return MachineError("not enough memory; free some, or lift its limit, then run the same command again")
     return None

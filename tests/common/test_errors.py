@@ -29,6 +29,8 @@ def test_failures_of_the_machine_say_what_to_do_and_defects_are_none() -> None:
     threads = failure_of_machine(RuntimeError("can't start new thread"))
     assert threads is not None and "not enough memory or threads" in threads.message
     assert failure_of_machine(threads) is threads
+    assert failure_of_machine(SystemError("error return without exception set")) is not None
+    assert failure_of_machine(SystemError("bad argument to internal function")) is None
     library = failure_of_machine(ImportError("x.so: failed to map segment from shared object"))
     assert library is not None and "not enough memory" in library.message
     assert failure_of_machine(ImportError("No module named x")) is None

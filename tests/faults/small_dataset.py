@@ -6,7 +6,6 @@ from pathlib import Path
 import click
 
 from graspq.common.options import Command
-from graspq.datagen.making import make_dataset
 from graspq.datagen.settings import CollectionSettings, DatagenSettings
 
 
@@ -25,6 +24,9 @@ class SmallDatagenSettings(DatagenSettings):
 @click.argument("objects", type=click.Path(path_type=Path))
 def main(size: int, out: Path, objects: Path) -> None:
     """Collect it."""
+    # Imported late, as grasp-datagen does: a Ctrl-C meanwhile is the command's to answer.
+    from graspq.datagen.making import make_dataset
+
     make_dataset(SmallDatagenSettings(size=size, out=out, objects=objects, workers=0))
 
 
